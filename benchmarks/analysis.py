@@ -33,7 +33,7 @@ def lap(what):
     last = now
 from trilat_net.analysis import LogMetrics
 from trilat_net.presentation.page import write_report
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net import open_log, verify
 from trilat_net.execution.virtual import SimulatedLog
 lap("start")
@@ -41,9 +41,9 @@ log = open_log(sys.argv[1])
 lap("opening")
 LogMetrics.of_log(log).to_dict()
 lap("metrics")
-certify_log(log)
+Certificate.of_log(log)
 lap("certificate")
-write_report(log, Path(sys.argv[2]), certificate=certify_log(log))
+write_report(log, Path(sys.argv[2]), certificate=Certificate.of_log(log))
 lap("report")
 SimulatedLog.without_operators(log)
 lap("twin")

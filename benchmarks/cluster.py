@@ -17,7 +17,7 @@ from pathlib import Path
 from trilat_studies.sweep import plan_sweep
 from trilat_studies.sweep.sweep_run import CellItem
 
-from trilat_net.work.executor import open_worker_pool, run_batch
+from trilat_net.work.executor import WorkerPool, run_batch
 from trilat_net.workers import worker_pool
 
 WORKERS = 2
@@ -63,7 +63,7 @@ def started_cluster(folder: Path) -> Iterator[str]:
 
 
 def pool_cells_per_s(tasks: list[CellItem], on: str | None) -> float:
-    with open_worker_pool(None if on else WORKERS, on) as pool:
+    with WorkerPool.open(None if on else WORKERS, on) as pool:
         pool.map(CellItem.run, tasks[:WARMED])
         begun = time.perf_counter()
         pool.map(CellItem.run, tasks)
@@ -73,7 +73,7 @@ def pool_cells_per_s(tasks: list[CellItem], on: str | None) -> float:
 def cluster_cells_per_s(tasks: list[CellItem]) -> float:
     with tempfile.TemporaryDirectory() as folder, started_cluster(Path(folder)) as address:
         while True:
-            with open_worker_pool(None, address) as pool:
+            with WorkerPool.open(None, address) as pool:
                 if pool.workers == WORKERS:
                     break
         return pool_cells_per_s(tasks, address)

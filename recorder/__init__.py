@@ -1,6 +1,6 @@
 """Records the messages of a running session in a log.
 
-The recorder is a process of its own (`record_process`), so that a slow disk cannot delay the
+The recorder runs in its own process (`record_process`), so that a slow disk cannot delay the
 control loops of the arms. It imports the network and the log, but neither the simulation, the
 control laws nor the scenarios.
 """

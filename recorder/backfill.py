@@ -1,16 +1,15 @@
-"""Requests messages again from their sender if they were lost on the network.
+"""Requests messages that were lost on the network from their sender again.
 
-The process of each arm (the site) publishes numbered messages, and the recorder writes them to
-a log. A gap in the numbers shows that a message was lost. If the last messages are lost, there
-is no gap. Therefore, if nothing arrives from a site for a while, the recorder requests the
-newest messages of that site (a probe). The functions do not wait. They receive the present time
-as an argument.
+Sites publish numbered messages, which the recorder writes to a log. A gap in the numbers shows
+that a message was lost. Losing the last messages leaves no gap. If nothing arrives from a site
+for a while, the recorder therefore requests the newest messages of that site (a probe). The
+functions never wait, and receive the present time as an argument.
 
 Invariant:
     - At most one request to a site is open at a time.
     - No request for missing messages is sent if no message is missing.
     - A message that the site no longer has is not requested again.
-    - Messages from the buffer of the site pass the same checks as published messages.
+    - Messages from the buffer of the site undergo the same checks as published messages.
 """
 
 from collections import Counter
@@ -33,33 +32,30 @@ from trilat_net.net import (
 from .site_reception import SiteMessage, SiteReception
 
 GRACE_NS = 50_000_000
-"""Time to wait before a missing message is requested, because it may only be late, in ns."""
+"""Time before a missing message is requested, in case it is only late, in ns."""
 SILENT_NS = 1_000_000_000
-"""Time without messages after which the newest messages of a site are requested, in ns.
+"""Time with no messages after which the newest messages of a site are requested, in ns.
 
 For slow sites, three tick periods are used instead.
 """
 ANSWER_NS = (300_000_000, 3_000_000_000)
-"""Shortest and longest timeout of a request, in ns. It doubles after each request without a
+"""Minimum and maximum timeout of a request, in ns. It doubles after each request without a
 reply.
 """
 _REST_NS = 250_000_000
-"""Pause after a reply without any new message, in ns."""
+"""Pause after a reply that contained no new message, in ns."""
 MAX_VAIN_REQUESTS = 20
-"""Number of successive replies without any new message after which the gaps are given up."""
+"""Number of consecutive replies with no new message after which the gaps are given up."""
 GIVE_UP_NS = 10_000_000_000
-"""Time without any new message, after a site has ended, until its gaps are given up, in ns."""
+"""Time with no new message, after a site has ended, until its gaps are given up, in ns."""
 
 
 RepairedMessage = tuple[str, SiteMessage, bytes]
-"""A message that a site sent again on request: channel, message and payload."""
+"""A message that a site resent on request: channel, message and payload."""
 
 
 class _OpenRequest(NamedTuple):
-    """A request for missing messages that the recorder has sent and that is not yet answered.
-
-    Messages can get lost on the network. The recorder then requests them again from their
-    sender.
+    """An unanswered request from the recorder for missing messages.
 
     Attributes:
         request: The request, which states the wanted message numbers.
@@ -73,10 +69,10 @@ class _OpenRequest(NamedTuple):
 
 
 class GapRepair:
-    """Requests messages that were lost on the network again from the site that sent them.
+    """Requests messages that were lost on the network from the site that sent them.
 
-    A site is the process that controls one arm. It keeps its recent messages in a buffer.
-    Without repair, the log would have gaps. An object serves one start of the site.
+    A site keeps its recent messages in a buffer for this purpose. Each object serves one start
+    of a site.
 
     Args:
         bus: Network connection of the recorder.
@@ -85,12 +81,12 @@ class GapRepair:
         site: Name of the site.
         boot: Random number that identifies the start of the site. None if the site has not
             appeared yet.
-        dropped: Numbers of dropped messages by reason. Invalid replies are added.
+        dropped: Mapping from reason to number of dropped messages. Invalid replies are added.
         now_ns: Present time on the monotonic clock, in ns.
         before: Repair of the previous start of the site. None for the first start.
 
     Attributes:
-        reception: Received messages of the site. It knows which numbers are missing.
+        reception: Messages received from the site, which determine the missing numbers.
     """
 
     def __init__(
@@ -135,7 +131,7 @@ class GapRepair:
 
     @property
     def is_active(self) -> bool:
-        """True if messages are missing that the site may still have, or if a reply is awaited.
+        """True if messages are missing that the site may still have, or if a reply is pending.
 
         The recorder then checks for replies more often than it writes to the disk.
         """
@@ -145,13 +141,12 @@ class GapRepair:
     def progress_ns(self) -> int:
         """Time at which the last missing message arrived, on the monotonic clock, in ns.
 
-        If this time lies far in the past, the site probably has none of the missing messages
-        any more.
+        If this was long ago, the site probably no longer has any of the missing messages.
         """
         return self._progress_ns
 
     def follow_start(self, boot: int) -> "GapRepair":
-        """Returns the repair of the next start of the site, which continues the counts.
+        """Returns the repair for the next start of the site, which continues the counts.
 
         Args:
             boot: Random number that identifies the next start.
@@ -169,23 +164,22 @@ class GapRepair:
     def probe(self) -> None:
         """Makes `poll` request the newest messages of every channel of the site.
 
-        The messages of a channel are numbered. Therefore a message reveals whether earlier ones
-        were lost. The loss of the last messages is revealed only by this request.
+        Because messages are numbered, each one shows whether earlier ones were lost. The loss
+        of the last messages can only be detected with this request.
         """
         self._probes = set(SITE_CHANNELS)
 
     def poll(self, now_ns: int, *, alive: bool) -> Iterator[RepairedMessage]:
-        """Receives the replies of the site, and sends the next request if messages are missing.
+        """Receives replies from the site, and sends the next request if messages are missing.
 
-        The recorder calls this regularly for each site, the process that runs one arm. The
-        method does not wait for replies.
+        The recorder calls this method regularly for each site. It never waits for replies.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
-            alive: True if the site is present on the network, so that it can reply.
+            alive: True if the site is present on the network and can reply.
 
         Yields:
-            The messages of the replies. Nothing if no reply has arrived.
+            The messages contained in the replies. Nothing if no reply has arrived.
         """
         if now_ns - self._polled_ns > SILENT_NS:
             # Nothing could arrive while this process was suspended, so the site was not silent.
@@ -211,9 +205,9 @@ class GapRepair:
     def _probe_if_silent(self, now_ns: int) -> None:
         """Requests the newest messages of a running site whose messages have stopped arriving.
 
-        If its last messages were lost, no later number shows a gap, so the recorder has to ask.
-        The silence is counted from the last message or the last probe. A slow site may take
-        three periods.
+        If its last messages were lost, no later number reveals the gap, so the recorder has to
+        ask. The silence is measured from the last message or the last probe. For a slow site,
+        three tick periods are allowed.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
@@ -227,12 +221,12 @@ class GapRepair:
             self.probe()
 
     def _send_request(self, now_ns: int) -> None:
-        """Sends the next request to the site, if messages are missing and the request is due.
+        """Sends the next request to the site if messages are missing and the request is due.
 
-        A message that has just been noticed as missing may only be late. Therefore the first
-        request is due `GRACE_NS` after that. The due time then stays in the past. Therefore a
-        request without a reply is repeated at once after its timeout. A reply sets a new due
-        time, see `_accept_reply`. If nothing is missing any more, the due time is cleared.
+        A message that has just been noticed as missing may only be late, so the first request
+        is due `GRACE_NS` later. The due time then stays in the past, and a request without a
+        reply is repeated immediately after its timeout. A reply sets a new due time, see
+        `_accept_reply`. Once nothing is missing any more, the due time is cleared.
 
         The caller ensures that no other request is open.
 
@@ -260,16 +254,17 @@ class GapRepair:
     def _make_request(self) -> BackfillRequest | None:
         """Chooses the channel and the numbers of the messages that are requested next.
 
-        The channels take turns, and the one that was requested longest ago is examined first.
-        The gaps of a channel are requested in ascending order. After the gap with the highest
-        numbers, the search begins again at the lowest ones, because replies may be incomplete.
+        The channels take turns, and the one whose last request is longest ago is examined
+        first. The gaps of a channel are requested in ascending order. After the gap with the
+        highest numbers, the search starts over at the lowest ones, because replies may be
+        incomplete.
 
         A probe requests the messages after the last known one. It reveals whether the site has
         published messages of which nothing has arrived.
 
         Returns:
-            A request for at most `_request_size` consecutive messages of one channel. None if
-            no message is missing and no probe is scheduled.
+            A request for at most `_request_size` consecutive messages of one channel, or None
+            if no message is missing and no probe is scheduled.
         """
         for channel in self._turns:
             account = self.reception.accounts[channel]
@@ -289,11 +284,11 @@ class GapRepair:
 
     @staticmethod
     def _extend_over_gaps(account: Account, last_missing: int, limit: int) -> int:
-        """Returns the last number of a request that also covers the gaps that follow closely.
+        """Returns the last number of a request, extended to cover gaps that follow closely.
 
-        On a busy machine, many single messages may be lost in a second. If each of these gaps
-        had its own request, the recorder would fall further behind than the site's buffer
-        reaches. The messages between the gaps arrive a second time and are ignored.
+        On a busy machine, many single messages may be lost in a second. With one request per
+        gap, the recorder would fall further behind than the site's buffer reaches. The messages
+        between the gaps arrive a second time and are ignored.
 
         Args:
             account: Account of the channel.
@@ -313,7 +308,7 @@ class GapRepair:
     def _receive_reply(
         self, open_request: _OpenRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
-        """Yields the messages of the reply, if it has arrived, or closes an expired request.
+        """Yields the messages in the reply if it has arrived, or closes an expired request.
 
         The timeout and the size of the next requests adapt to the connection:
 
@@ -323,15 +318,15 @@ class GapRepair:
           repeated. The timeout is doubled and the number of requested messages is halved,
           because small replies get through a bad connection more easily.
 
-        An invalid reply is counted as dropped, and otherwise has no effect: the request stays
-        open until a valid reply arrives or the timeout ends.
+        An invalid reply is counted as dropped and has no other effect: the request stays open
+        until a valid reply arrives or the timeout expires.
 
         Args:
             open_request: The open request.
             now_ns: Present time on the monotonic clock, in ns.
 
         Yields:
-            The new messages of a valid reply. Nothing if no valid reply has arrived.
+            The new messages in a valid reply. Nothing if no valid reply has arrived.
         """
         request = open_request.request
 
@@ -359,23 +354,23 @@ class GapRepair:
             self._open = None
 
     def _decode(self, payload: bytes, request: BackfillRequest) -> Backfill:
-        """Decodes a reply to a request, and checks that it belongs to this request.
+        """Decodes a reply to a request, and checks that the two belong together.
 
         If the site no longer stores the first requested messages, the reply begins at a higher
-        number than requested. But it cannot begin after the number of messages that the site
-        has published so far, which the reply states. A probe requests messages that may not
-        exist. A reply that begins exactly at the requested number is therefore always valid.
+        number than requested. It cannot, however, begin after the number of messages that the
+        site has published so far, which the reply states. A probe requests messages that may
+        not exist, so a reply that begins exactly at the requested number is always valid.
 
         Args:
-            payload: The encoded reply of the site.
+            payload: The site's encoded reply.
             request: The request that is open.
 
         Returns:
             The reply: consecutive messages of one channel.
 
         Raises:
-            WireError: The reply is not valid, comes from another process, or contains other
-                messages than those that were requested.
+            WireError: The reply is invalid, comes from another process, or contains messages
+                other than those requested.
         """
         backfill = decode(payload, Backfill)
         self.reception.check_sender(backfill)
@@ -394,10 +389,10 @@ class GapRepair:
     def _accept_reply(
         self, backfill: Backfill, request: BackfillRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
-        """Evaluates a reply that contains messages that were lost before.
+        """Evaluates a reply with previously lost messages, and yields those that are new.
 
-        The messages that are new are yielded. A reply that fills no gap is counted, because the
-        recorder gives up after several of them. Finally the next request is scheduled.
+        A reply that fills no gap is counted, because the recorder gives up after several of
+        them. Finally, the next request is scheduled.
 
         Args:
             backfill: The reply.
@@ -448,7 +443,7 @@ class GapRepair:
     def _count_vain_request(self, channel: str) -> None:
         """Counts a request that filled no gap, and gives up after `MAX_VAIN_REQUESTS` of them.
 
-        All messages that are missing in the channel then count as permanently missing.
+        All messages that are missing on the channel then count as permanently missing.
 
         Args:
             channel: Channel of the missing messages.

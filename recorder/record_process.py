@@ -1,14 +1,13 @@
 """Runs the recorder: a process that joins a session, writes its messages, and ends with it.
 
-The processes of a session, which each control one arm (the sites), publish the state of their
-arms, typically a thousand times per second. The recorder writes these messages to a log. Each
-site keeps its recent messages in a buffer, from which the recorder requests those that it
-missed.
+Sites publish the state of their arms, typically a thousand times per second, and the recorder
+writes these messages to a log. Each site keeps its recent messages in a buffer, from which the
+recorder requests those that it missed.
 
 Invariant:
-    - No message is lost that has arrived, or that a site still has in its buffer.
-    - Messages get the time of their arrival and wait in one bounded queue. One thread writes
-      them.
+    - A message is never lost once it has arrived, or while a site still has it in its buffer.
+    - Messages are stamped with their time of arrival and wait in a single bounded queue. One
+      thread writes them.
     - The file is flushed about every 65 ms, and completed whenever the process ends without a
       crash.
     - The first signal, such as Ctrl-C, ends the recorder after it has received the messages
@@ -47,42 +46,41 @@ NICE = -5
 Sites have a higher priority, because their ticks are due within a millisecond.
 """
 POLL_NS = 10_000_000
-"""Pause between two polls in ns, while the recorder waits for the session or for missing
-messages.
+"""Pause between polls while the recorder waits for the session or for missing messages, in ns.
 """
 _END_S = 10
-"""Time without any missing message after which the recorder ends, once a signal has told it to,
-in s. Sites keep their messages for that long.
+"""Time in s with no recovered message after which the recorder ends, once a signal has told it
+to. Sites keep their messages for that long.
 """
 END_NS = _END_S * 1_000_000_000
 LONGEST_END_NS = 60_000_000_000
-"""Longest time after a signal in which the sites' remaining messages are requested, in ns."""
+"""Maximum time after a signal during which the sites' remaining messages are requested, in ns.
+"""
 FLUSH_NS = 65_000_000
-"""Period with which the messages are written and flushed, in ns.
+"""Interval at which the messages are written and flushed, in ns.
 
-A crash loses at most the messages of this time.
-
-A longer period costs less computing time.
+A crash loses at most the messages of one interval. A longer interval costs less computing time.
 """
 
 
 ReadScenario = Callable[[str, str], tuple[SessionScenario, MakeViews | None]]
-"""Function that reads the text of a resolved scenario, which another process has sent.
+"""Function that parses the text of a resolved scenario, which another process has sent.
 
 Its second argument is the name of the text, for error messages. The text is not trusted. The
-result has the names, rates and sizes of the sites, from which the messages to expect follow.
-It also has a function that creates the messages for viewers of logs, or None if the log
+result contains the names, rates and sizes of the sites, which determine the expected messages.
+It also contains a function that creates the messages for log viewers, or None if the log
 contains no such messages. The recorder does not import the code that interprets scenarios, so
-that its caller provides this function.
+its caller provides this function.
 """
 CollectProvenance = Callable[[], Mapping[str, str]]
-"""Function that returns the facts about this program that a log contains, see `provenance`."""
+"""Function that returns the information about this program stored in a log, see `provenance`.
+"""
 
 
 class Recorder:
-    """Process that records one session: joins it, writes its messages, and completes the log.
+    """Records one session: joins it, writes its messages, and completes the log.
 
-    The recorder is a process of its own, so that a slow disk cannot delay the control loops of
+    The recorder runs in its own process, so that a slow disk cannot delay the control loops of
     the arms.
 
     Args:
@@ -91,11 +89,11 @@ class Recorder:
         session: Name of the session.
         boot: Random number that identifies this start of the recorder.
         storage: Place where the log is written.
-        read_scenario: Function that reads the text of the session's scenario.
-        provenance: Facts about this program that the log contains.
+        read_scenario: Function that parses the text of the session's scenario.
+        provenance: Information about this program that is stored in the log.
         stopped: Function that returns True if the recorder must end at once.
         say: Function that prints a line for the user.
-        is_ending: Function that returns True if the recorder must end when it has the messages
+        is_ending: Function that returns True if the recorder must end once it has the messages
             that the sites still have, or after `END_NS`.
     """
 
@@ -138,16 +136,16 @@ class Recorder:
         )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits until the session begins, or joins a session that is running already.
+        """Waits until the session begins, or joins a session that is already running.
 
-        All processes of a session, the recorder included, first agree on a common start time.
+        All members of a session, including the recorder, first agree on a common start time.
 
         Args:
-            timeout_s: Longest time to wait, in s. If None, there is no limit.
+            timeout_s: Longest wait, in s. If None, there is no limit.
 
         Returns:
-            The common start time of the session, and the boot number of each member, which
-            identifies a start of its process. None if the recorder has to stop before the
+            The common start time of the session, and the boot of each member (the number that
+            identifies a start of its process). None if the recorder has to stop before the
             session begins.
 
         Raises:
@@ -171,10 +169,7 @@ class Recorder:
         return None
 
     def record(self, epoch: Epoch) -> Recording:
-        """Writes the messages of the session to the log file until the session ends.
-
-        A session is a group of processes that each control one arm. They publish their results
-        on the network, and the recorder stores them in a log, an MCAP file.
+        """Writes the messages of the session to the log (an MCAP file) until the session ends.
 
         Args:
             epoch: Common start time of the session.
@@ -184,12 +179,12 @@ class Recorder:
 
         Raises:
             UsageError: The file cannot be created.
-            LogRefused: The disk refused the data. The error states which part is saved.
+            LogRefused: Writing to the disk failed. The error states which part is saved.
         """
         scenario, make_views = self._find_scenario(epoch)
 
         def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
-            """Creates the writer for one MCAP file. A long log is divided into several files.
+            """Creates the writer for one MCAP file. A long log is split into several files.
 
             Args:
                 stream: The open file.
@@ -242,12 +237,11 @@ class Recorder:
         return recording
 
     def _find_scenario(self, epoch: Epoch) -> tuple[SessionScenario, MakeViews | None]:
-        """Returns the scenario to record, and the function that makes channels for viewers.
+        """Returns the scenario to record, and the function that creates channels for viewers.
 
-        A member has sent the scenario with its identity. The function is None if no such
-        channels are recorded.
-        A recorder needs no scenario file. Members that were started again after the common
-        start was agreed are ignored. They have another boot, the random number of a start.
+        The scenario is part of a member's identity, so a recorder needs no scenario file. The
+        function is None if no channels for viewers are recorded. Members that were restarted
+        after the common start was agreed have a different boot, and are ignored.
 
         Args:
             epoch: Agreed start of the session, with the boots of its members.
@@ -261,12 +255,10 @@ class Recorder:
         return self._read_scenario(sender.scenario, sender.member)
 
     def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        """Announces on the network that the recorder runs.
+        """Announces on the network that the recorder is running.
 
-        A recorder that joins late also requests earlier messages.
-
-        The other processes of the session wait for this announcement, from which they know that
-        their messages are recorded.
+        The announcement tells the other processes of the session, which wait for it, that their
+        messages are recorded. A recorder that joins late also requests earlier messages.
 
         Args:
             recording: The recording, which has just been created.
@@ -292,8 +284,8 @@ class Recorder:
     def _receive_presence(self, recording: Recording) -> None:
         """Informs the recording which processes have joined the session's network or left it.
 
-        Zenoh, the network library, reports both. From these reports the recording decides which
-        sites (processes that control an arm) it still has to wait for before it closes the log.
+        Zenoh, the network library, reports both. The recording uses these reports to decide
+        which sites it still has to wait for before closing the log.
         """
         while (change := self._presence.poll()) is not None:
             key, alive = change
@@ -302,7 +294,7 @@ class Recorder:
     def _run(self, recording: Recording, report: RecorderReport) -> None:
         """Writes received messages to the log at regular intervals until the session is over.
 
-        The loop also ends if the recorder itself is asked to end, for example by Ctrl-C.
+        The loop also ends if the recorder itself is told to end, for example by Ctrl-C.
 
         Args:
             recording: The recording, whose log is written.
@@ -335,11 +327,11 @@ class Recorder:
             self._repair_until(recording, now_ns + FLUSH_NS)
 
     def _repair_until(self, recording: Recording, until_ns: int) -> None:
-        """Waits until a given time. Meanwhile missing messages are requested and written.
+        """Waits until a given time while requesting and writing missing messages.
 
-        A site replies with few messages at a time, so as not to delay its control loop. If the
-        next request waited for the next flush, a recorder that was delayed on a busy machine
-        would never catch up.
+        A site sends only a few messages per reply, to avoid delaying its control loop. If each
+        request waited for the next flush, a recorder that was delayed on a busy machine would
+        never catch up.
 
         Args:
             recording: The recording.
@@ -368,23 +360,19 @@ def record_session(
 ) -> int:
     """Records a session in this process, from finding it on the network to the finished log.
 
-    A session is a group of processes (sites) that each control one arm. They publish the
-    results of every control period, which the recorder writes to an MCAP file.
-
     Args:
         session: Name of the session.
-        storage: Place where the log is written.
+        storage: Place where the log (an MCAP file) is written.
         connection: How to connect to the session, see `connect_to_session`.
-        read_scenario: Function that reads the text of the session's scenario.
-        collect_provenance: Function that returns the facts about this program that the log
-            contains. It is called once the recorder is connected.
-        join_timeout_s: Longest time to wait until the session begins, in s. If None, there is
-            no limit.
+        read_scenario: Function that parses the text of the session's scenario.
+        collect_provenance: Function that returns the information about this program that is
+            stored in the log. It is called once the recorder is connected.
+        join_timeout_s: Longest wait for the session to begin, in s. If None, there is no limit.
         clock: Clock of the recorder.
         say: Function that prints a line for the user.
         afterwards: Function that processes the finished log, unless the session was
-            interrupted. The recorder remains a member of the session until then. Sites with
-            `--stay` wait for that.
+            interrupted. The recorder remains a member of the session until it returns, and
+            sites with `--stay` wait for that.
         warn: Function that is called when the connection is open, to warn the user of risks.
 
     Returns:

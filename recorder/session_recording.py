@@ -1,18 +1,17 @@
 """Records one session: writes its messages, finds missing ones, and publishes statistics.
 
-The messages come from sites, the processes that each run one arm. A site may be started again
-while the session runs. Each start has a boot, a random number that identifies it, and the new
-start continues the numbers of the records, the messages with the state of the arm in each
-period of its control loop.
+A site may be restarted while the session is running. Each start is identified by its boot (a
+random number). The numbering of the records continues across starts.
 
 Invariant:
     - A message of the session is written once, byte for byte. Any other message is counted as
       dropped, with the reason.
-    - The recorder publishes the event "stored" about a site when it has every message of the
+    - The recorder publishes the event "stored" about a site once it has every message from the
       site that can still be obtained. A site that has ended waits for this event, but only for
       a limited time.
-    - Statistics are published and recorded once a second, with a bounded size. All times are
-      measured by the monotonic clock. If the wall clock is set, only the statistics show it.
+    - Statistics are published and recorded once per second, with a bounded size. All times are
+      measured with the monotonic clock. If the wall clock is set, this is visible only in the
+      statistics.
 """
 
 from collections import Counter
@@ -39,17 +38,15 @@ from .site_reception import AWAY_NS, InboundQueue, SiteMessage, SiteReception
 SETTLE_NS = 1_000_000_000
 """Time to wait for messages in transit after a site has ended and disappeared, in ns."""
 RECONNECT_NS = 10_000_000_000
-"""Time to wait for a site that has ended but still has missing records, if its connection is
-interrupted, in ns.
-"""
+"""Time to wait for a disconnected site that has ended but still has missing records, in ns."""
 _HEARD_NS = 500_000_000
-"""A site counts as running if one of its messages arrived within this time, in ns."""
+"""Time since its last message within which a site counts as running, in ns."""
 _UNDER_WAY_NS = 100_000_000
-"""Time for which messages of a site that has disappeared may have been in transit, in ns."""
+"""Time for which messages from a site that has disappeared may have been in transit, in ns."""
 STARTS_KEPT = 4096
-"""Largest number of starts of sites that are remembered before they are recorded."""
+"""Maximum number of starts of sites that are remembered before they are recorded."""
 LAST_NS = 6_000_000_000
-"""Longest time that a site stays after its last tick: 5 s and a margin, in ns."""
+"""Maximum time that a site stays after its last tick: 5 s plus a margin, in ns."""
 
 
 class Recording:
@@ -64,15 +61,16 @@ class Recording:
         epoch: Common start time of the session, and the boots of its members. A boot is a
             random number that identifies one start of a process.
         bus: Network connection of the recorder.
-        publisher: Publishes the recorder's own events. It also puts them into the queue of the
+        publisher: Publishes the recorder's own events. It also puts them into the queue of
             received messages, so that they are recorded.
 
     Attributes:
         session: Name of the session.
         epoch: Common start time of the session, and the boots of its members.
         publisher: Publishes the recorder's own events.
-        accounts: For each channel, the counts of received and missing messages, by key.
-        dropped: Number of messages that were not written, by the reason.
+        accounts: Mapping from the key of each channel to the counts of received and missing
+            messages.
+        dropped: Mapping from reason to the number of messages that were not written.
     """
 
     def __init__(
@@ -148,7 +146,7 @@ class Recording:
         The recorder publishes the event "late" with the time at which it joins, and an event
         "lost" for each site that is not present. The sites keep their messages in buffers for
         some time. The newest messages of each site are requested (a probe), and their numbers
-        then show which earlier messages are missing. `write` requests those as well.
+        show which earlier messages are missing. `write` then requests those too.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
@@ -158,7 +156,7 @@ class Recording:
         self.publisher.publish(
             "late",
             f"the recorder joins at t = {since_epoch_ns / 1e9:.3f} s; "
-            f"it requests the earlier messages from {', '.join(present_sites)}",
+            f"it requests earlier messages from {', '.join(present_sites)}",
             t_ns=since_epoch_ns,
         )
         for name in self._gone_sites:
@@ -167,16 +165,15 @@ class Recording:
             repair.probe()
 
     def assume_gone(self) -> None:
-        """Regards every site as gone until the network reports that it is present.
+        """Treats every site as gone until the network reports that it is present.
 
-        A site is a process that controls one arm. A recorder that joins a running session
-        cannot know which sites have left before. If it expected messages of such a site, it
-        would wait forever.
+        A recorder that joins a running session cannot know which sites have already left. If it
+        expected messages from such a site, it would wait forever.
         """
         self._gone_sites = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
-        """Writes the messages that have arrived into the log, and requests missing messages.
+        """Writes the messages that have arrived to the log, and requests missing messages.
 
         A site that has ended waits until the recorder has all its messages. As soon as this is
         the case, the recorder publishes the event "stored" for the site.
@@ -199,25 +196,24 @@ class Recording:
     def is_repairing(self) -> bool:
         """True while messages are missing that may still be obtained from their sender.
 
-        This is so if a site that has the messages is still present, or if the recorder waits
-        for its reply to a request. The log is not closed in the meantime.
+        This is the case if a site that has the messages is still present, or if its reply to a
+        request is pending. The log is not closed in the meantime.
         """
         return any(repair.is_active for repair in self._repairs.values())
 
     @property
     def repaired_ns(self) -> int:
-        """Time at which the latest missing message of any site arrived, in ns.
+        """Arrival time of the latest recovered message, on the monotonic clock, in ns.
 
-        It is a time of the monotonic clock. A recorder that ends stops waiting for missing
-        messages if this time lies too far in the past.
+        If this was too long ago, a recorder that is ending stops waiting for missing messages.
         """
         return max(repair.progress_ns for repair in self._repairs.values())
 
     def _repair_gaps(self, name: str, repair: GapRepair, now_ns: int) -> None:
-        """Writes messages that a site sent again on request, and requests further missing ones.
+        """Writes messages that a site resent on request, and requests further missing ones.
 
-        Three time scales occur: the monotonic clock, the time since the epoch (the start of the
-        session), and the Unix time, which the log states as the time of arrival.
+        Three time scales are used: the monotonic clock, the time since the epoch (the start of
+        the session), and Unix time, which the log contains as the time of arrival.
 
         Args:
             name: Name of the site.
@@ -243,9 +239,8 @@ class Recording:
     def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
         """Announces that the log has all messages of one site that can still be obtained.
 
-        A site is the process that controls one arm. Its process waits for this event before it
-        ends, because it keeps messages that the recorder may request again. The text says which
-        messages stay missing.
+        The site waits for this event before it ends, because it keeps messages that the
+        recorder may request again. The text of the event says which messages remain missing.
 
         Args:
             site: Reception of the site, which has ended.
@@ -264,10 +259,10 @@ class Recording:
         )
 
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
-        """Writes the messages of the queue, and counts those that cannot be written as dropped.
+        """Writes the messages in the queue, and counts those that cannot be written as dropped.
 
-        The writing thread calls this regularly. A message that cannot be written, for example
-        because it is invalid, must not end the recording.
+        The writing thread calls this method regularly. A message that cannot be written, for
+        example because it is invalid, must not end the recording.
 
         Args:
             queue: Queue of the received messages.
@@ -286,12 +281,12 @@ class Recording:
                 self.dropped[error.reason] += 1
 
     def _admit_starts(self) -> None:
-        """Begins to record the next start of each site that was started again.
+        """Begins to record the next start of each site that was restarted.
 
-        A start is one execution of the site's process. A second start may also be a mistake, so
-        that two processes act as the same site. Therefore the next start is recorded only if
-        the previous one has disappeared or ended, or if another site of the session has
-        admitted the new start. Until then it remains in `_next_boots`.
+        A second start may also be a mistake that makes two processes act as the same site. The
+        next start is therefore recorded only if the previous one has disappeared or ended, or
+        if another site of the session has admitted the new start. Until then, it remains in
+        `_next_boots`.
         """
         for name, boot in list(self._next_boots.items()):
             previous = self._sites[name]
@@ -325,10 +320,10 @@ class Recording:
                 self._gone_sites.discard(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
-        """Notes that a site was started again, if a message is the event that announces it.
+        """Registers that a site was restarted, if a message is the event that announces it.
 
         From then on, messages of the new start are expected. A message that announces another
-        member, or a scenario in which sites may not return, changes nothing.
+        member, or belongs to a scenario in which sites may not return, has no effect.
 
         Args:
             name: Name of the site under whose key the message arrived.
@@ -347,19 +342,20 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Evaluates an event by which one site reports that another site was started again.
+        """Evaluates an event in which one site reports that another site was restarted.
 
-        There are two such events, and both state the boot, the random number that identifies
-        the new start:
+        There are two such events, and both state the boot (the random number that identifies
+        the new start):
 
         - "admit": The reporting site has admitted the new start to the session. If this start
-          is not recorded yet, it will be recorded now.
-        - `LAST`: The number of ticks (records of control periods) that the reporting site had
-          received before the new start. It is evaluated when the new start is being recorded,
-          because it shows how many messages of the previous start are missing.
+          is not recorded yet, it will be recorded from now on.
+        - `LAST`: The number of ticks whose samples the reporting site had received before the
+          new start. It is evaluated once the new start is being recorded, because it shows how
+          many messages of the previous start are missing.
 
         Args:
-            event: Any decoded message of a site. Messages other than these events are ignored.
+            event: Any decoded message of a site. All messages other than these events are
+                ignored.
         """
         if not isinstance(event, Event) or event.about not in self._sites:
             return
@@ -382,10 +378,10 @@ class Recording:
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
-        """Decodes a message of a site, the process that controls one arm.
+        """Decodes a message from a site.
 
-        If the process has been restarted and this is its first message, the new start is
-        recorded from now on.
+        If the site has been restarted and this is its first message, the new start is recorded
+        from now on.
 
         Args:
             key: Key under which the message arrived.
@@ -395,7 +391,7 @@ class Recording:
             The site that sent the message, and the message.
 
         Raises:
-            WireError: The message is not valid.
+            WireError: The message is invalid.
         """
         site, channel = self._channels[key]
         try:
@@ -408,9 +404,9 @@ class Recording:
             return site, site.read(channel, payload)
 
     def _write_site_message(self, key: str, payload: bytes, mono_ns: int) -> None:
-        """Writes an event or statistics of a site, unless they were written before.
+        """Writes an event or statistics from a site, unless they have already been written.
 
-        The log states two times of a message: the sending time, in ns since the epoch (the
+        The log contains two times for a message: the sending time, in ns since the epoch (the
         start of the session), and the arrival time, as Unix time.
 
         Args:
@@ -419,7 +415,7 @@ class Recording:
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
         Raises:
-            WireError: The message is not valid.
+            WireError: The message is invalid.
         """
         arrived_since_epoch_ns = mono_ns - self.epoch.mono_ns
         if key not in self._channels:
@@ -444,10 +440,10 @@ class Recording:
         self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
 
     def _write_block(self, key: str, block: bytes, mono_ns: int) -> None:
-        """Writes the records of a block, the results of several control periods of a site.
+        """Writes the records of a block, which contains the results of several ticks of a site.
 
-        The first payload that is not a valid record ends the block, because its sender is
-        faulty.
+        The rest of the block is skipped after the first payload that is not a valid record,
+        because its sender is faulty.
 
         Args:
             key: Key under which the block arrived.
@@ -466,12 +462,12 @@ class Recording:
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
     def _write_recorder_message(self, key: str, payload: bytes, mono_ns: int) -> None:
-        """Writes an event or statistics of this recorder, after a check that they are its own.
+        """Writes an event or statistics of this recorder, after checking that they are its own.
 
-        The recorder puts its own messages into the queue of received messages. But other
-        processes can publish under the same keys, for example a second recorder. Their messages
-        are refused: a message must state the boot, the random number that identifies this start
-        of the recorder.
+        The recorder puts its own messages into the queue of received messages. Other processes,
+        for example a second recorder, can publish under the same keys. Their messages are
+        rejected: a message must state the boot (the random number that identifies this start of
+        the recorder).
 
         Args:
             key: Key of the message: the key of recorders' events or of their statistics.
@@ -479,7 +475,7 @@ class Recording:
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
         Raises:
-            WireError: The message is from another recorder, or is not valid.
+            WireError: The message is from another recorder, or is invalid.
         """
         account = self._recorder_accounts[key]
         since_epoch_ns = mono_ns - self.epoch.mono_ns
@@ -507,19 +503,19 @@ class Recording:
             self._writer.add(key, payload, sent_ns, log_time_ns, number, event)
 
     def note_presence(self, key: str, alive: bool) -> None:
-        """Notes that a site appeared on the network, or disappeared from it.
+        """Registers that a site has appeared on the network or disappeared from it.
 
-        The network announces each start of a site by a token, which disappears with the
+        The network announces each start of a site with a token, which disappears with the
         process.
 
-        A token may belong to another start than the one that is being recorded: an earlier one,
-        or one that may be recorded later. It says nothing about the recorded start. But its
-        disappearance is noted in case that start is recorded later, because the network does
-        not report it again (`_admit_starts`). The number of such notes is limited.
+        A token may belong to a start other than the one being recorded: an earlier one, or one
+        that may be recorded later. It does not affect the recorded start. Its disappearance is
+        noted anyway, since the other start may be recorded later and the network will not
+        report the disappearance again (`_admit_starts`). The number of such notes is limited.
 
         Args:
-            key: Key of the token, which contains the name of the site and the boot, the random
-                number that identifies the start.
+            key: Key of the token, which contains the name of the site and the boot (the random
+                number that identifies the start).
             alive: True if the token appeared, False if it disappeared.
         """
         token = topics.parse_key(key)
@@ -537,15 +533,15 @@ class Recording:
             self._gone_sites.add(token.member)
 
     def _update_gone_since_ns(self, site: str, now_ns: int) -> int | None:
-        """Notes when a site was first found gone, and returns when the wait for it begins.
+        """Registers when a site was first found gone, and returns when the wait for it begins.
 
-        The caller uses the result to decide how long it still waits for the site.
+        The caller uses the result to decide how much longer to wait for the site.
 
-        When a connection is established again, the network may report the return of a site
-        first, and its earlier disappearance afterwards. The report "gone" is then wrong, which
-        only the messages of the site reveal: a message that arrives more than `_UNDER_WAY_NS`
-        after the report cannot have been in transit. In this case, the wait restarts with each
-        message. As long as messages arrive, the site is thus never given up.
+        After a reconnection, the network may report the return of a site first, and its earlier
+        disappearance afterwards. The report that the site is gone is then wrong, which only the
+        messages from the site reveal: a message that arrives more than `_UNDER_WAY_NS` after
+        the report cannot have been in transit. In this case, the wait restarts with each
+        message, so the site is never given up as long as messages arrive.
 
         Args:
             site: Name of the site.
@@ -566,16 +562,13 @@ class Recording:
         return last_message_ns
 
     def is_over(self, now_ns: int) -> bool:
-        """Determines whether the recording can end, because no site can send any more messages.
+        """Returns True if the recording can end, because no site can send any more messages.
 
+        For every site, either all messages must be stored, or the site must be gone for good.
         The recorder then completes the log file and ends.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
-
-        Returns:
-            True if, for every site, either all messages are stored or the site is gone for
-            good.
         """
         # Every site is examined, because `_has_left` notes the time at which a site
         # disappeared.
@@ -583,17 +576,14 @@ class Recording:
         return all(have_left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
-        """Returns True if the recorder need not wait for any more messages of a site.
+        """Returns True if the recorder no longer has to wait for messages from a site.
 
         This is the case if all messages of the site are stored, or if the site has been absent
-        from the network for so long that it is regarded as gone for good.
+        from the network for so long that it is considered gone for good.
 
         Args:
-            site: Name of the site, the process that runs one arm.
+            site: Name of the site.
             now_ns: Present time on the monotonic clock, in ns.
-
-        Returns:
-            True if all messages are stored, or the site is gone for good.
         """
         if site in self._stored_sites:
             return True
@@ -619,18 +609,18 @@ class Recording:
         return now_ns - absent_since_ns > wait_ns
 
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
-        """Determines whether the recorder has every message that the sites have sent by now.
+        """Determines whether the recorder has every message that the sites have sent so far.
 
-        The recorder calls this method repeatedly after it was told to end while the session
-        still runs. A site is a process that runs one arm. There are three cases for each site:
+        The recorder calls this method repeatedly after it was told to end while the session is
+        still running. There are three cases for each site:
 
-        - The site has left: no more messages of it are expected (`_has_left`).
-        - The site runs and sends messages. Its messages are numbered. Gaps in the numbers show
-          which messages are missing. If there are no gaps `SETTLE_NS` after the recorder was
-          told to end, the messages that were in transit at that time have arrived.
+        - The site has left, and no more messages are expected from it (`_has_left`).
+        - The site is running and sending messages, whose numbers show which messages are
+          missing. If there are no gaps `SETTLE_NS` after the recorder was told to end, the
+          messages that were in transit at that time have arrived.
         - Otherwise, the site has ended or is silent, but has not left. It may have sent
-          messages of which the recorder knows nothing, or the last check of its messages is
-          still pending. The recorder then waits until the site runs again or has left.
+          messages unknown to the recorder, or the last check of its messages may still be
+          pending. The recorder then waits until the site is running again or has left.
 
         Args:
             ending_ns: Time at which the recorder was told to end, on the monotonic clock, in
@@ -638,7 +628,7 @@ class Recording:
             now_ns: Present time on the monotonic clock, in ns.
 
         Returns:
-            True if every site has left, or runs and has no missing message.
+            True if every site has left, or is running with no missing messages.
         """
         may_be_in_transit = now_ns - ending_ns <= SETTLE_NS
         for name, site in self._sites.items():
@@ -653,10 +643,10 @@ class Recording:
         return True
 
     def flush(self) -> None:
-        """Passes all messages in the memory of this process to the operating system.
+        """Passes all messages buffered in this process to the operating system.
 
-        After this call they are in the file even if this process crashes. Without it, a crash
-        would lose the messages since the last call.
+        They are then in the file even if this process crashes. Otherwise, a crash would lose
+        the messages since the last call.
         """
         self._writer.flush()
 
@@ -667,7 +657,7 @@ class Recording:
 
         Args:
             queue: Queue of the received messages.
-            rest: True to first write the messages that still wait in the queue.
+            rest: True to first write the messages that are still in the queue.
         """
         if rest:
             self._drain(queue, None)
@@ -675,15 +665,15 @@ class Recording:
         self._writer.finish(self.render_accounts(queue))
 
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
-        """Formats the numbers of received and missing messages as text to be stored in the log.
+        """Formats the numbers of received and missing messages for storage in the log.
 
-        A reader of the log can see from these numbers whether the log is complete.
+        They show a reader of the log whether it is complete.
 
         Args:
-            queue: Queue of the received messages, which counts those for which it had no room.
+            queue: Queue of the received messages, which counts those that it could not hold.
 
         Returns:
-            A line for each topic, and the number of dropped messages for each reason.
+            One line per topic, and the number of dropped messages for each reason.
         """
         # Counts of the events of earlier starts of a site, by key.
         event_accounts = {}
@@ -703,9 +693,8 @@ class Recording:
     def render_summary(self) -> list[str]:
         """Returns lines that tell the user at the end whether the log is complete.
 
-        Returns:
-            A line for each site with the numbers of its records, and a line for each reason why
-            messages were not written.
+        There is one line per site with the numbers of its records, and one line for each reason
+        why messages were not written.
         """
         lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
@@ -716,7 +705,7 @@ class Recording:
         return lines
 
     def _summarize_site(self, site: SiteReception) -> str:
-        """Returns a line for the user about the records of a site, at the end of the recording.
+        """Summarises the records of a site in one line for the user, when recording ends.
 
         Example: "recorder: s: 12000 of 12000 records, 0 missing, 3 duplicate, largest gap 2".
 
@@ -744,14 +733,14 @@ class Recording:
         return line
 
     def describe_problem(self) -> str | None:
-        """Returns the first problem of the recording, which becomes the recorder's error text.
+        """Returns the first problem of the recording, which becomes the recorder's error.
 
-        The recorder ends with an error if the log is not complete, so that nobody uses an
-        incomplete log unknowingly. A site is a process that controls one arm.
+        The recorder ends with an error if the log is incomplete, so that nobody uses an
+        incomplete log unknowingly.
 
         Returns:
-            A sentence about a site that disappeared or lacks messages. None if there is no
-            problem.
+            A sentence about a site that disappeared or whose messages are missing, or None if
+            there is no problem.
         """
         for name, site in self._sites.items():
             if site.final_ticks is None:
@@ -764,17 +753,17 @@ class Recording:
 
 
 REPORT_EVERY_NS = 1_000_000_000
-"""Period of the statistics, in ns."""
+"""Interval between statistics, in ns."""
 _MAX_GAPS_REPORTED = 20
-"""Largest number of gaps of a channel that the statistics list."""
+"""Maximum number of gaps per channel that the statistics list."""
 _ALL_GAPS = 600
-"""Largest number of gaps of all channels together that the statistics list."""
+"""Maximum number of gaps that the statistics list for all channels together."""
 
 
 class RecorderReport:
-    """Publishes statistics of a recording once a second, such as its size and missing messages.
+    """Publishes statistics of a recording once per second, such as its size and losses.
 
-    They show a person who watches the session whether the log is complete and how large it is.
+    During the session, they show whether the log is complete and how large it is.
 
     Args:
         bus: Network connection of the recorder.
@@ -803,9 +792,9 @@ class RecorderReport:
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
 
     def note_flush(self, duration_ns: int) -> None:
-        """Notes how long the operating system took to accept the written messages.
+        """Registers the time the operating system took to accept the written messages, in ns.
 
-        A slow disk first shows up in these times. The next statistics state the longest one.
+        A slow disk first shows up in these times. The next statistics contain the longest one.
 
         Args:
             duration_ns: The time, in ns.
@@ -813,11 +802,7 @@ class RecorderReport:
         self._flush_max_ns = max(self._flush_max_ns, duration_ns)
 
     def poll(self) -> None:
-        """Publishes the statistics of the recording if they are due, once a second.
-
-        The statistics state, for example, the size of the log and the numbers of missing
-        messages.
-        """
+        """Publishes the statistics of the recording if due, which is once per second."""
         now_ns = self._clock.monotonic_ns()
         if now_ns < self._due_ns:
             return
@@ -828,10 +813,10 @@ class RecorderReport:
         self.publish()
 
     def publish(self) -> None:
-        """Publishes the statistics of the recording now, and also writes them into the log.
+        """Publishes the statistics of the recording now, and also writes them to the log.
 
-        People see losses during the session, and readers of the log see them afterwards. The
-        longest duration of a flush is reset for the next statistics.
+        They show losses during the session, and to readers of the log afterwards. The longest
+        duration of a flush is reset for the next statistics.
         """
         payload = encode(self._make_stats())
         self._flush_max_ns = 0
@@ -839,9 +824,9 @@ class RecorderReport:
         self._publish(payload)
 
     def _make_stats(self) -> RecorderStats:
-        """Returns the present statistics of the recording for people who watch the session.
+        """Returns the current statistics of the recording, to be shown during the session.
 
-        They contain, for each channel, the numbers of expected, received and missing messages,
+        For each channel, they contain the numbers of expected, received and missing messages,
         and the ranges of the missing ones.
         """
         recording = self._recording

@@ -1,21 +1,20 @@
-"""Receives the messages of a session, checks them, and finds out which are missing.
+"""Receives the messages of a session, checks them, and determines which are missing.
 
-The recorder must neither lose messages in a burst nor believe a faulty sender. `InboundQueue`
-holds the messages between the threads of the network and the thread that writes the log.
-`SiteReception` decodes, checks and counts the messages of one site, the process that runs one
-arm.
+The recorder must neither lose messages in a burst nor trust a faulty sender. `InboundQueue`
+holds the messages between the network threads and the thread that writes the log.
+`SiteReception` decodes, checks and counts the messages of one site.
 
 Invariant:
     - The queue is bounded in messages and in bytes. The bytes of each sender's channel are
-      bounded as well, so that one sender with too many messages does not displace the messages
-      of the others. Messages for which there is no room are counted and reported.
-    - A message is accepted only if it can be decoded, states the right site and the right start
+      bounded too, so that a sender with too many messages does not displace the messages of
+      others. Messages for which there is no space are counted and reported.
+    - A message is accepted only if it can be decoded, names the right site and the right start
       of its process, and has a number that the site can have reached by now.
-    - A message may imply that earlier messages exist. The number of records and statistics that
-      are therefore expected is limited by the duration of the scenario. A message from the
-      future is refused.
+    - A message may imply that earlier messages exist. The number of records and statistics
+      expected as a result is limited by the duration of the scenario. A message from the future
+      is rejected.
     - The events of a site are accepted up to a number of bytes. The first event "end", with
-      which a site states that it has ended, is accepted even beyond that limit.
+      which a site reports that it has ended, is accepted even beyond that limit.
 """
 
 import math
@@ -45,32 +44,32 @@ from trilat_net.recorded_change import count_skipped_ticks
 AWAY_NS = 15_000_000_000
 """Time to wait for a site that disappeared without an "end" event, in ns.
 
-Its link may have been cut, and may work again.
+Its link may have been cut and may recover.
 """
 CAPACITY = 60_000
-"""Largest number of messages in the queue. It suffices for minutes of three sites at 1 kHz,
-which send their records in blocks.
+"""Maximum number of messages in the queue, enough for minutes of three sites at 1 kHz, which
+send their records in blocks.
 """
 CAPACITY_BYTES = 96 << 20
-"""Largest size of the queue, in bytes."""
+"""Maximum size of the queue, in bytes."""
 KEY_BYTES = 32 << 20
-"""Largest size of the waiting messages of one key, in bytes. A planar arm at 1 kHz sends half a
-megabyte per second.
+"""Maximum total size of the queued messages of one key, in bytes. A planar arm at 1 kHz sends
+half a megabyte per second.
 """
 _OVERHEAD_BYTES = 200
-"""Memory of a waiting message besides its payload, in bytes."""
+"""Memory used by a queued message in addition to its payload, in bytes."""
 KEYS = 1_000
-"""Largest number of keys that are counted separately. All further keys are counted together."""
+"""Maximum number of keys that are counted separately. All further keys are counted together."""
 _OTHER_KEYS = "others"
 """Name under which the keys beyond `KEYS` are counted."""
 
 
 class _InboundMessage(NamedTuple):
-    """A network message in the recorder's queue, which is not yet decoded or written to a log.
+    """A network message in the recorder's queue that has not been decoded or logged yet.
 
     Attributes:
-        key: Network address ("key") under which the message was published. It names the
-            session, the member and the channel.
+        key: Key under which the message was published. It names the session, the member and the
+            channel.
         payload: Bytes of the message.
         mono_ns: Time of the arrival on the monotonic clock, in ns.
     """
@@ -81,16 +80,16 @@ class _InboundMessage(NamedTuple):
 
 
 class InboundQueue:
-    """Bounded queue of messages between the threads of the network and the writing thread.
+    """Bounded queue of messages between the network threads and the writing thread.
 
-    While the disk is slow, messages wait here. A message is dropped and counted if the queue is
-    full, because an unbounded queue could use up the memory.
+    Messages wait here while the disk is slow. If the queue is full, a message is dropped and
+    counted, because an unbounded queue could use up the memory.
 
     Args:
         clock: Clock that determines the times of arrival.
 
     Attributes:
-        overflowed: Number of messages for which there was no room, by key.
+        overflowed: Mapping from key to the number of messages for which there was no space.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -110,10 +109,10 @@ class InboundQueue:
         return len(self._queue)
 
     def receive(self, key: str, payload: bytes) -> None:
-        """Adds a message to the queue with the time of its arrival, if there is room.
+        """Adds a message to the queue with its time of arrival, if there is space.
 
-        The network calls this method in its threads. The bytes of each key are limited, so that
-        one sender cannot fill the queue.
+        Called in the network threads. The bytes of each key are limited, so that one sender
+        cannot fill the queue.
 
         Args:
             key: Key under which the message was published.
@@ -137,17 +136,16 @@ class InboundQueue:
             self._queue.append(_InboundMessage(key, payload, self._clock.monotonic_ns()))
 
     def drain(self, until_ns: int | None = None) -> Iterator[_InboundMessage]:
-        """Removes waiting messages from the queue, so that they can be written.
+        """Removes messages from the queue, so that they can be written.
 
-        The threads of the network fill the queue, and the thread that writes the log calls this
-        method.
+        Called in the thread that writes the log, while the network threads fill the queue.
 
         Args:
             until_ns: Messages that arrived after this time stay in the queue, in ns on the
                 monotonic clock. If None, all messages are removed.
 
         Yields:
-            The messages, the oldest one first.
+            The messages, oldest first.
         """
         queue = self._queue
         while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
@@ -161,33 +159,30 @@ class InboundQueue:
 
 
 _CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
-"""Name of the messages of each channel, for texts."""
+"""Noun for the messages of each channel, used in sentences for the user."""
 _LEAD_NS = 2_000_000_000
 _DRIFT = 1e-3
-"""The clock of a site may be ahead of the recorder's clock by `_LEAD_NS`, plus this fraction of
-the time since the start of the session.
+"""Fraction of the time since the start of the session by which a site's clock may be ahead of
+the recorder's clock, in addition to `_LEAD_NS`.
 """
 EVENT_BYTES = 512 << 10
 _EVENT_BYTES_PER_S = 4 << 10
-"""A log accepts `EVENT_BYTES` of events of a site, and `_EVENT_BYTES_PER_S` more per second of
-the scenario, which is about ten events.
+"""Additional bytes of events that a log accepts from a site per second of the scenario, beyond
+`EVENT_BYTES`. This is enough for about ten events.
 """
 _LEAST_EVENT_BYTES = 128
-"""Smallest size of an event, in bytes."""
+"""Minimum size of an event, in bytes."""
 
 
 class SiteMessage(NamedTuple):
-    """A decoded message of a site, with the numbers under which the log stores it.
-
-    A site is a process that controls one arm. It publishes a record of each control period
-    (tick), statistics of its network links, and events.
+    """A decoded message from a site, with the numbers under which the log stores it.
 
     Attributes:
-        number: Number of the message in its channel. It is -1 for an event without a number.
+        number: Number of the message in its channel. -1 for an event without a number.
         sequence: Sequence number in the log: the tick of a record or of statistics, or the
             number of an event.
-        t_ns: Sending time after the start of the session, on the sender's clock, in ns. It is
-            negative before the start.
+        t_ns: Sending time relative to the start of the session, on the sender's clock, in ns.
+            Negative before the start.
         content: The decoded message.
     """
 
@@ -198,10 +193,10 @@ class SiteMessage(NamedTuple):
 
 
 class SiteReception:
-    """Received messages from one start of a site, and the counts of its missing messages.
+    """Receives the messages from one start of a site, and counts the missing ones.
 
-    A site is the process that controls one arm. If it is started again, a new object is
-    created, which continues the counts of the previous one.
+    If the site is restarted, a new object is created, which continues the counts of the
+    previous one.
 
     Args:
         scenario: Scenario of the session.
@@ -212,15 +207,15 @@ class SiteReception:
     Attributes:
         name: Name of the site.
         accounts: Counts of the messages of each channel. Records and statistics are counted
-            over all starts. Events are counted from 0 for every start.
+            over all starts, and events from 0 for every start.
         event_accounts: Counts of the events of the previous starts.
-        skipped_ticks: Number of ticks that the site skipped, over all starts. The account of
-            the records counts these ticks as unpublished.
+        skipped_ticks: Number of ticks that the site skipped, over all starts. They are counted
+            as unpublished in the account of the records.
         final_ticks: Number of ticks that the site executed. None until its "end" event arrives.
         last_received_ns: Arrival of the last message on the monotonic clock, in ns. None before
             the first message.
-        since_ns: Present time after the start of the session, on the recorder's clock, in ns.
-            The caller sets it. Messages of later ticks are refused.
+        since_ns: Present time relative to the start of the session, on the recorder's clock, in
+            ns. Set by the caller. Messages of later ticks are rejected.
         period_ns: Tick period of the site, in ns.
     """
 
@@ -270,9 +265,9 @@ class SiteReception:
         self._largest_counts[topics.EVENT] = self._event_bytes_left // _LEAST_EVENT_BYTES
 
     def split(self, channel: str, block: bytes) -> Iterable[bytes]:
-        """Splits the bytes that arrived in a channel into the payloads of single messages.
+        """Splits the bytes that arrived on a channel into the payloads of single messages.
 
-        A block in the channel of records contains several records.
+        A block on the channel of records contains several records.
 
         Args:
             channel: Name of the channel.
@@ -281,20 +276,19 @@ class SiteReception:
         return split_states(block) if channel == topics.STATE else (block,)
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
-        """Decodes a message of a site and checks its sender and number, without counting it.
+        """Decodes a message from a site and checks its sender and number, without counting it.
 
-        A site is the process that controls one arm. The message is written to the log only if
-        this method accepts it.
+        The message is written to the log only if this method accepts it.
 
         Args:
-            channel: Name of the channel in which the message arrived.
+            channel: Name of the channel on which the message arrived.
             payload: Bytes of the message.
 
         Returns:
-            The decoded message, with its number. Pass it to `accept` or `refill` to count it.
+            The decoded message with its number. Pass it to `accept` or `refill` to count it.
 
         Raises:
-            WireError: The payload is not a valid message of this site in this channel.
+            WireError: The payload is not a valid message from this site on this channel.
         """
         if channel == topics.EVENT:
             return self._read_event(payload)
@@ -312,10 +306,10 @@ class SiteReception:
         return SiteMessage(number, content.tick, sent_ns, content)
 
     def _read_event(self, payload: bytes) -> SiteMessage:
-        """Decodes and checks an event, and subtracts its size from the permitted bytes.
+        """Decodes and checks an event, and subtracts its size from the allowed bytes.
 
-        An event is a rare message, for example about the end of the run. The total size of a
-        site's events is limited, so that a faulty sender cannot fill the disk.
+        The total size of a site's events is limited, so that a faulty sender cannot fill the
+        disk.
 
         Raises:
             WireError: The payload is not a valid event of this site, or there were too many.
@@ -341,16 +335,16 @@ class SiteReception:
         return SiteMessage(event.n, event.n, event.t_ns, event)
 
     def _check(self, channel: str, sender: str, boot: int, number: int, ticks: int) -> None:
-        """Checks that a message comes from the current start of the site and is plausible now.
+        """Raises WireError if a message is from another sender or start, or implausible.
 
-        A site that was restarted has a new start, and messages of its earlier process must no
+        A site that was restarted has a new start, and messages from its earlier process must no
         longer be accepted. A number that is too large would make the recorder request messages
         that do not exist.
 
         Args:
             channel: Channel of the message.
-            sender: Name of the site that the message states.
-            boot: Number that identifies the sender's start, as the message states it.
+            sender: Name of the site stated in the message.
+            boot: Number that identifies the sender's start, as stated in the message.
             number: Number of the message in its channel.
             ticks: Number of ticks that the site has executed according to the message.
 
@@ -375,18 +369,16 @@ class SiteReception:
     def accept_records(
         self, payloads: Iterable[bytes], received_ns: int
     ) -> Iterator[tuple[bytes, State]]:
-        """Decodes, checks and counts records of the site that arrived together in one block.
+        """Decodes, checks and counts records from the site that arrived together in one block.
 
-        A site is a process that runs one arm. A record is the message with the results of one
-        tick, a period of its control loop, and has the number of that tick.
-
-        A record is valid if it states this site and the right boot (the random number that
+        A record is valid if it names this site, the right boot (the random number that
         identifies the start of the site), and a tick that the site can have reached by now.
-        Each valid record is counted by its number, so that gaps show which records are missing.
+        Each valid record is counted by its number, which is that of its tick, so gaps show
+        which records are missing.
 
-        At 1 kHz, this loop runs for a thousand records per second and site. Therefore it reads
-        attributes only once, and compares the values itself instead of calling `_check` for
-        each record.
+        At 1 kHz, this loop processes a thousand records per second and site. For speed, it
+        reads attributes only once, and compares the values itself instead of calling `_check`
+        for each record.
 
         Args:
             payloads: The encoded records, in the order of sending.
@@ -429,8 +421,8 @@ class SiteReception:
     def _possible_ticks(self) -> int:
         """Largest number of ticks that the site can have executed by now.
 
-        The time since its start is stretched by the tolerated drift and lead of its clock. A
-        message with a later tick is refused, because it would make all earlier ticks count as
+        The time since its start is extended by the tolerated drift and lead of its clock. A
+        message with a later tick is rejected, because it would make all earlier ticks count as
         missing.
         """
         latest_ns = self.since_ns * (1.0 + _DRIFT) + _LEAD_NS
@@ -439,8 +431,8 @@ class SiteReception:
     def _reserve_event_bytes(self, event: Event, size: int) -> None:
         """Limits how many bytes of events one site may add to the log.
 
-        Without this limit, a faulty site could fill the disk. The size of each event is
-        subtracted from the bytes that remain.
+        Otherwise, a faulty site could fill the disk. The size of each event is subtracted from
+        the remaining bytes.
 
         Args:
             event: The event.
@@ -459,10 +451,10 @@ class SiteReception:
         self._event_bytes_left -= size
 
     def accept(self, channel: str, message: SiteMessage, received_ns: int) -> bool:
-        """Counts a published message, and finds messages that are missing before it.
+        """Counts a published message, and detects messages that are missing before it.
 
         A gap between its number and that of the previous message shows that messages are
-        missing. The method is for messages that were sent without a request.
+        missing. Use `refill` for messages that were sent on request.
 
         Args:
             channel: Name of the channel.
@@ -470,7 +462,7 @@ class SiteReception:
             received_ns: Arrival of the message on the monotonic clock, in ns.
 
         Returns:
-            True if the message is new. False if it was received before.
+            True if the message is new, or False if it was received before.
         """
         self.last_received_ns = received_ns
         account = self.accounts[channel]
@@ -479,27 +471,27 @@ class SiteReception:
         return is_new
 
     def refill(self, channel: str, message: SiteMessage) -> bool:
-        """Counts a message that the site sent again from its buffer after a request.
+        """Counts a message that the site resent from its buffer on request.
 
-        The log may contain each message only once. Therefore a message that has arrived already
-        is not counted again.
+        The log may contain each message only once, so a message that has already arrived is not
+        counted again.
 
         Args:
             channel: Name of the channel.
-            message: The message, as `read` has decoded and checked it.
+            message: The message, decoded and checked by `read`.
 
         Returns:
-            True if the message fills a gap. False if it was received before.
+            True if the message fills a gap, or False if it was received before.
         """
         is_new = self.accounts[channel].refill(message.number)
         self._count_implied(message.content)
         return is_new
 
     def check_sender(self, reply: Backfill) -> None:
-        """Checks that a reply with missing messages comes from the right start of a process.
+        """Raises WireError if a reply with missing messages comes from another start or site.
 
-        A site is the process that controls one arm. The reply of an earlier start of this
-        process would contain messages with the same numbers but other contents.
+        The reply of an earlier start would contain messages with the same numbers but different
+        contents.
 
         Args:
             reply: The reply to the recorder's request.
@@ -515,10 +507,10 @@ class SiteReception:
             )
 
     def add_expected(self, channel: str, count: int) -> None:
-        """Notes that a site has published at least a given number of messages in a channel.
+        """Registers that a site has published at least a given number of messages on a channel.
 
         Expected messages that have not been received count as missing. Since a faulty site
-        could state any number, the number is limited to what is possible in the scenario by
+        could report any number, the number is limited to what is possible in the scenario by
         now.
 
         Args:
@@ -532,23 +524,22 @@ class SiteReception:
         self.accounts[channel].add_expected(min(count, largest))
 
     def count_previous_start(self, ticks: int) -> None:
-        """Notes a lower limit of the number of ticks that a site executed before its restart.
+        """Registers the minimum number of ticks that a site executed before its restart.
 
-        A tick is one control period of a site, the process that controls one arm. A site that
-        was killed could not state the number, but other sites have received its samples (sent
-        states). Without the number, records lost at the end of the previous start would not be
-        counted as missing.
+        A site that was killed could not report the number itself, but other sites have received
+        its samples. Without the number, records lost at the end of the previous start would not
+        be counted as missing.
 
         Args:
-            ticks: Number of ticks that another site reports.
+            ticks: Number of ticks reported by another site.
         """
         for channel, gap in self._start_gaps.items():
             gap.note_published(number_message(channel, ticks, self._rate_hz))
 
     def _count_implied(self, content: State | LinkStats | Event) -> None:
-        """Derives from a message which other messages of its sender exist.
+        """Derives from a message which other messages from its sender exist.
 
-        A message that exists and did not arrive is counted as missing. A record states which
+        Messages that exist but have not arrived are counted as missing. A record states which
         ticks were skipped. Statistics show that all records up to their tick exist. The events
         "join" and "end" state the first tick and the number of ticks.
         """
@@ -565,7 +556,7 @@ class SiteReception:
                 self.add_expected(channel, count)
 
     def _exclude_skipped_ticks(self, record: State) -> None:
-        """Notes that no messages exist for control periods (ticks) that the site has skipped.
+        """Registers that no messages exist for ticks that the site has skipped.
 
         A site with an external arm skips ticks that came too late. They must not count as lost
         messages.
@@ -587,12 +578,12 @@ class SiteReception:
                 self.skipped_ticks += next_number - lowest_unpublished
 
     def _begin_start(self, first_tick: int) -> None:
-        """Counts the messages between the previous start of the site and this one.
+        """Accounts for the messages between the previous start of the site and this one.
 
-        A site that was started again continues at a later tick. The messages of the ticks in
+        A site that was restarted continues at a later tick. The messages of the ticks in
         between count as unpublished instead of missing. If the previous start ended properly,
-        it has stated how many ticks it executed, and its messages up to that tick still count
-        as missing. If it was killed, that number is unknown and counts as 0. Reports of other
+        it has reported how many ticks it executed, and its messages up to that tick still count
+        as missing. If it was killed, that number is unknown and taken as 0. Reports from other
         sites may correct this, see `count_previous_start`.
 
         Args:
@@ -609,7 +600,7 @@ class SiteReception:
 
     @property
     def lacks_messages(self) -> bool:
-        """True if a message is missing that its sender can still send again.
+        """True if a message is missing that its sender can still resend.
 
         Messages that the sender has overwritten in its buffer do not count.
         """
@@ -619,25 +610,24 @@ class SiteReception:
     def is_complete(self) -> bool:
         """True if the site has ended and the recorder has received all of its messages.
 
-        A site is a process that controls one arm. When it ends, it publishes how many control
-        periods it has executed, from which the recorder knows what to expect.
+        When a site ends, it publishes how many ticks it has executed, which determines the
+        messages to expect.
         """
         return self.final_ticks is not None and not self.lacks_messages
 
     def give_up(self) -> None:
-        """Stops requesting missing messages of a site that can no longer send them.
+        """Stops requesting missing messages from a site that can no longer send them.
 
-        A site is a process that controls one arm. If it has crashed, its buffer of sent
-        messages is lost. The messages remain counted as missing in the summary of the log.
+        If a site has crashed, its buffer of sent messages is lost. The messages are still
+        counted as missing in the summary of the log.
         """
         for account in self.accounts.values():
             account.abandon_below(account.last + 1)
 
     def describe_missing(self) -> str:
-        """Returns a text for the user about the missing messages of one site.
+        """Describes the missing messages of one site, for the user.
 
-        A site is the process that controls one arm. Messages that were lost and could not be
-        requested again leave gaps in the log.
+        Messages that were lost and could not be obtained again leave gaps in the log.
 
         Returns:
             The number of missing messages and their first ranges, for each channel. Empty if no

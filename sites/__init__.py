@@ -1,9 +1,9 @@
 """Runs live sessions, in which several robot arms are coupled over a network.
 
-Each arm is controlled by a process of its own, its site. A site joins the session together with
-the other sites, runs the control loop of its arm at a fixed rate, exchanges the state of the
-arm with the other sites in every period, and leaves at the end. The package also contains the
-programs around a session, such as those that start it, move an arm, or measure the network.
+Each arm is controlled by its own process, the site. A site joins the session together with the
+other sites, runs the control loop of its arm at a fixed rate, exchanges the state of the arm
+with the other sites in every tick, and leaves at the end. The package also contains programs
+that start a session, move an arm, or measure the network.
 """
 
 from typing import TYPE_CHECKING

@@ -1,21 +1,20 @@
-"""Replies to requests of users who change something while an arm is running.
+"""Answers users' requests for changes while an arm is running.
 
 For example, `trilat set` changes the delay of a network link, and `trilat stop` stops an arm.
-Such a command sends a request to the site, the process that controls the arm. Before each tick
-of its control loop, the site checks the requests that have arrived, and replies to each of
-them.
+Such a command sends a request to the site. Before each tick of its control loop, the site
+checks the requests that have arrived and replies to each of them.
 
 Invariant:
-    - Every request gets a reply: it is accepted, or refused with a reason. An accepted change
-      is part of the log, in the record of the tick that accepts it, so that the run can be
-      reproduced.
+    - Every request is answered: it is either accepted, or rejected with a reason. An accepted
+      change is stored in the log, in the record of the tick that accepts it, so that the run
+      can be reproduced.
     - A change of a link or of weights takes effect `AHEAD_MS` after it was accepted, because
-      some decisions are made in advance. For example, the delay of a sample that has been sent
-      cannot change any more.
-    - An order to stop an arm is executed at once. The orders "enable" and "reset" are never
-      executed in the same tick as another order, so that they cannot undo a stop. They wait for
-      the next tick, as do the requests that arrived after them.
-    - A change of weights is spread over at least `MIN_RAMP_S`, whatever the request states, so
+      some decisions are made in advance. For example, the delay of a sample can no longer
+      change once the sample has been sent.
+    - A command to stop an arm is executed at once. The commands "enable" and "reset" are never
+      executed in the same tick as another command, so that they cannot undo a stop. They wait
+      for the next tick, as do the requests that arrived after them.
+    - A change of weights is spread over at least `MIN_RAMP_S`, whatever the request says, so
       that the reference of the arm does not jump. The log contains the actual duration.
 """
 
@@ -42,37 +41,37 @@ from trilat_net.records import Mode
 from trilat_net.scenario import LinkTables, Scenario, resolve_change
 
 AHEAD_MS = 100
-"""Time from the acceptance of a change until it takes effect, in ms."""
+"""Time from accepting a change until it takes effect, in ms."""
 MIN_RAMP_S = 0.5
-"""Shortest duration of a change of weights, in s."""
+"""Minimum duration of a change of weights, in s."""
 MARKS_WAITING = 16
-"""Largest number of marks that wait to be published. A site publishes them every 100 ms."""
+"""Maximum number of unpublished marks. A site publishes its marks every 100 ms."""
 
 
 _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
-"""Orders that have an effect only in one mode, with that mode."""
+"""Mapping from each command that has an effect in only one mode to that mode."""
 
 
 class ChangeServer:
-    """Checks the requests to one site, replies, and keeps the accepted changes for its loop.
+    """Answers requests to a site, and keeps the accepted changes for its control loop.
 
-    A request changes for example the delay of a link, or orders the site to stop its arm. The
-    control loop of the site calls `pop_changes` before each tick, a period of the loop.
+    A request may, for example, change the delay of a link or tell the site to stop its arm. The
+    control loop of the site calls `pop_changes` before each tick.
 
     Args:
         scenario: Scenario of the session.
         site: Name of the site.
-        queries: Requests of the operator, who may change everything.
+        queries: Requests from the operator, who may change everything.
         mode: Function that returns the mode of the site after its last tick.
         held: Function that returns True if the dead-man switch is held or if there is none. If
-            it is not held, the orders "enable" and "reset" are refused.
-        stops: Requests of other members, who may only stop the site. None if there are none.
+            it returns False, the commands "enable" and "reset" are rejected.
+        stops: Requests from other members, who may only stop the site. None if there are none.
 
     Attributes:
         stopped: True if the next tick is the last one before a requested end of the run.
-        marks: Marks that are not published yet: pairs of a tick and a text.
-        sources: Who requested each accepted change, by the text of the change as the record of
-            the tick contains it. The entry is removed when the change is published.
+        marks: Marks that have not been published yet, as pairs of tick and text.
+        sources: Mapping from each accepted change, as written in the record of the tick, to the
+            name of its requester. An entry is removed when the change is published.
     """
 
     def __init__(
@@ -109,17 +108,16 @@ class ChangeServer:
         self.sources: dict[str, str] = {}
 
     def pop_changes(self, next_tick: int) -> Sequence[CoreChange]:
-        """Replies to all waiting requests of users, and returns the changes for the next tick.
+        """Answers all pending requests from users, and returns the changes for the next tick.
 
-        A tick is one period of the control loop of the arm, which calls this method before each
-        tick.
+        The control loop of the arm calls this method before each tick.
 
         Args:
             next_tick: Number of the next tick.
 
         Returns:
-            The changes that the site applies in that tick. Empty if none was accepted since the
-            last call.
+            The changes that the site applies in that tick. Empty if none were accepted since
+            the last call.
         """
         self._update_stopped(next_tick)
 
@@ -152,14 +150,14 @@ class ChangeServer:
     def _accept(
         self, request: ChangeRequest, next_tick: int
     ) -> tuple[str, int, CoreChange | None]:
-        """Carries out the request of a user, or refuses it with an error.
+        """Carries out a user's request, or rejects it with an error.
 
-        A request changes a setting, marks the present moment in the log, gives an order such as
-        "stop" to the arm, or ends the run.
+        A request changes a setting, marks the present moment in the log, gives the arm a
+        command such as "stop", or ends the run.
 
         Args:
             request: The request.
-            next_tick: Number of the next tick, a period of the control loop.
+            next_tick: Number of the next tick.
 
         Returns:
             The text of the reply, the first tick in which the request has an effect, and the
@@ -167,7 +165,7 @@ class ChangeServer:
             run.
 
         Raises:
-            ScenarioError: The site refuses the request.
+            ScenarioError: The site rejects the request.
         """
         if request.stop_s is not None:
             text, end_tick = self._schedule_stop(next_tick, request.stop_s)
@@ -193,10 +191,11 @@ class ChangeServer:
         return text, first, change
 
     def _poll(self) -> Query | None:
-        """Returns the next waiting request of a user. None if no request waits.
+        """Returns the next pending request from a user, or None if there is none.
 
-        Orders to stop from other processes come first, for safety. The request that had to wait
-        for a tick without orders comes next, and then the requests of the operator.
+        For safety, stop commands from other processes come first. They are followed by the
+        request that had to wait for a tick with no other command, and then by the requests from
+        the operator.
         """
         query = self._poll_stop()
         if query is None:
@@ -205,10 +204,10 @@ class ChangeServer:
         return query
 
     def _poll_stop(self) -> Query | None:
-        """Returns the next order to stop from a process that may send no other request.
+        """Returns the next stop command from a process that may send no other request.
 
-        Any process of a session may stop an arm for safety, while only the operator may change
-        settings. Other requests of such a process are refused here. The order may name its
+        For safety, any process of a session may stop an arm, while only the operator may change
+        settings. Other requests from such a process are rejected here. The command may name its
         source.
         """
         while self._stops is not None and (query := self._stops.poll()) is not None:
@@ -222,19 +221,19 @@ class ChangeServer:
         return None
 
     def _add_mark(self, next_tick: int, text: str) -> str:
-        """Stores a mark, a text for the log, until its event is published.
+        """Stores a mark (a text for the log) until its event is published.
 
-        For example, a user marks the moment of a contact, to find it in the log later.
+        For example, a user marks the moment of a contact to find it in the log later.
 
         Args:
-            next_tick: Next tick, which the mark names.
+            next_tick: Next tick, at which the mark is placed.
             text: Text of the mark, for example "contact".
 
         Returns:
             The reply to the user, for example "s marks tick 1200".
 
         Raises:
-            ScenarioError: Too many marks wait.
+            ScenarioError: Too many marks are waiting.
         """
         if len(self.marks) >= MARKS_WAITING:
             raise ScenarioError(
@@ -244,17 +243,17 @@ class ChangeServer:
         return f"{self._site} marks tick {next_tick}"
 
     def _make_order_change(self, tick: int, order: SiteOrder) -> CoreChange:
-        """Converts an order of a user into the change that the control loop carries out.
+        """Converts a user's command to the change that the control loop carries out.
 
-        By such an order, a user stops an arm, lets it move again, or clears a fault.
+        Such commands stop an arm, let it move again, or clear a fault.
 
         Args:
-            tick: Number of the tick, a period of the control loop.
-            order: The order: "stop", "enable" or "reset".
+            tick: Number of the tick.
+            order: The command: "stop", "enable" or "reset".
 
         Raises:
-            ScenarioError: The site is not in the mode that the order needs, or the dead-man
-                switch is not held.
+            ScenarioError: The site is not in the mode that the command requires, or the
+                dead-man switch is not held.
         """
         mode = self._read_mode()
         needed = _NEEDED_MODES.get(order)  # None for the order to stop
@@ -279,12 +278,12 @@ class ChangeServer:
         All arms of a session receive the same time, so that they stop together.
 
         Args:
-            next_tick: Number of the next tick, a period of the control loop. This tick is
-                always executed, so the run cannot end before it.
-            stop_s: Requested end, in s since the epoch, the common start of the session.
+            next_tick: Number of the next tick. It is always executed, so the run cannot end
+                before it.
+            stop_s: Requested end, in s since the epoch (the common start of the session).
 
         Returns:
-            The text of the reply, and the first tick that is not executed any more.
+            The text of the reply, and the first tick that will not be executed.
         """
         planned_end = self._ticks if self._stop_tick is None else self._stop_tick
         requested_end = first_tick_at(round(stop_s * 1e9), self._rate_hz)
@@ -296,24 +295,19 @@ class ChangeServer:
         return text, self._stop_tick
 
     def _update_stopped(self, next_tick: int) -> None:
-        """Sets the flag `stopped` if the run must end after the next tick, as a user requested.
-
-        A tick is a period of the control loop.
-        """
+        """Sets the flag `stopped` if a user has asked the run to end after the next tick."""
         if self._stop_tick is not None:
             self.stopped = next_tick + 1 >= self._stop_tick
 
     def _make_change(self, request: ChangeRequest, first: int) -> CoreChange:
-        """Converts a user's request into a change of a network link or of dominance factors.
-
-        Dominance factors say how strongly the arm follows each of the other arms.
+        """Converts a user's request to a change of a network link or of dominance factors.
 
         Args:
             request: The request.
             first: First tick in which the change is in effect.
 
         Raises:
-            ScenarioError: The change is not valid, comes too late, or there have been too many
+            ScenarioError: The change is invalid or comes too late, or there have been too many
                 changes.
         """
         from_ns = tick_ns(first, self._rate_hz)

@@ -1,14 +1,14 @@
 """Limits the computing time of a user's code: a control law, an operator or an arm model.
 
-The control loop of an arm calls such code, and slow code would make its ticks (periods) late.
-Each call may take 75 % (`SHARE`) of the time between two calls. If a call takes longer, the
-excess is added to the overtime. If it takes less, the overtime is reduced by the unused time.
-If the overtime exceeds `OVERTIME_LIMIT_NS`, the code is too slow, and the run ends with an
-error. One call counts for at most `HICCUP_NS`, so that a single slow call, for example during
-garbage collection, does not end the run.
+The control loop of an arm calls such code, and slow code would delay its ticks. Each call may
+take 75 % (`SHARE`) of the time between two calls. If a call takes longer, the excess is added
+to the overtime; if it takes less, the unused time is subtracted. If the overtime exceeds
+`OVERTIME_LIMIT_NS`, the code is too slow, and the run ends with an error. A single call counts
+for at most `HICCUP_NS`, so one slow call, for example during garbage collection, does not end
+the run.
 
 If the operating system has interrupted the thread during a call, the computing time of the
-thread counts instead of the elapsed time. Load that other programs cause is therefore not
+thread is used instead of the elapsed time. Load caused by other programs is therefore not
 counted against the code.
 
 Code that does not return at all is interrupted by a signal, see `CodeWatchdog`.
@@ -33,24 +33,24 @@ except ImportError:  # this platform lacks the module: elapsed time counts
 
 T = TypeVar("T")
 SHARE = 0.75
-"""Fraction of a period that the code may use."""
+"""Fraction of the time between two calls that the code may use."""
 OVERTIME_LIMIT_NS = 500_000_000
 """Overtime above which the code is too slow, in ns."""
 HICCUP_NS = 50_000_000
-"""Largest time that one call adds to the overtime, in ns."""
+"""Maximum time that one call adds to the overtime, in ns."""
 _CHECK_S = 1.0
-"""Time between two checks of whether the code still hangs in the same call, in s."""
+"""Interval between checks of whether the code still hangs in the same call, in s."""
 CHECKS = 3
-"""Number of checks in a row that must see the same call before it is interrupted."""
+"""Number of consecutive checks that must see the same call before it is interrupted."""
 FIRST_CHECKS = 61
-"""Number of checks in a row for the first tick, in which the code may still be compiled."""
+"""Number of consecutive checks for the first tick, when code may still be compiled."""
 
 
 def _read_thread_usage() -> tuple[int, int]:
     """Returns the computing time of this thread, and how often the system interrupted it.
 
-    Two readings show whether a slow call has computed for long itself, or whether the operating
-    system ran other programs in the meantime.
+    Two readings show whether a slow call has really been computing for long, or whether the
+    operating system was running other programs in the meantime.
 
     Returns:
         The computing time in ns, and the number of involuntary context switches. The values are
@@ -65,11 +65,11 @@ def _read_thread_usage() -> tuple[int, int]:
 class WatchedCode:
     """Calls a user's own code, such as a control law, and limits its computing time.
 
-    The control loop of the arm calls the code in every period, for example every millisecond.
+    The control loop of the arm calls the code in every tick, for example every millisecond.
     Code that is too slow would make the arm unsafe, and ends the run with an error.
 
     Args:
-        name: Name of the code, as in "the law mylaw:MyLaw".
+        name: Name of the code, such as "the law mylaw:MyLaw".
         rate_hz: How often the code is called, in 1/s.
         fail: Function that receives a tick and the description of a problem, and returns the
             error to raise.
@@ -79,7 +79,7 @@ class WatchedCode:
     Attributes:
         hiccups: Number of calls that took longer than the period between two calls.
         longest_ns: Duration of the longest call, in ns.
-        longest_tick: Tick of that call. It is -1 before the first call.
+        longest_tick: Tick of the longest call. -1 before the first call.
     """
 
     def __init__(
@@ -111,21 +111,17 @@ class WatchedCode:
         self._checked_count = -1  # the number of finished calls at the last check
 
     def run(self, tick: int, call: Callable[[], T]) -> T:
-        """Calls the user's code once, and measures its computing time.
+        """Calls the user's code once, measures its computing time and returns its result.
 
-        Time in which the operating system executed other programs does not count, because the
-        user's code is not to blame for it.
+        Time that the operating system gave to other programs is not counted.
 
         Args:
-            tick: Number of the tick, a period of the control loop, in which the code is called.
+            tick: Number of the tick in which the code is called.
             call: Function that calls the code.
 
-        Returns:
-            The result of the code.
-
         Raises:
-            Exception: If the code is too slow, the error of `fail`. Otherwise the error that
-                the code raises.
+            Exception: If the code is too slow, the error returned by `fail`. Otherwise, any
+                error that the code raises.
         """
         computed_ns, switches = self._usage()
         begun_ns = self._clock.monotonic_ns()
@@ -149,12 +145,12 @@ class WatchedCode:
     def _count_call(self, tick: int, elapsed_ns: int) -> None:
         """Adds the duration of a call to the statistics, and fails if the code is too slow.
 
-        Each call may take a share of the time between two calls. The excess is summed as
-        overtime, which shorter calls reduce again. Thus single slow calls are tolerated.
+        Each call may take a share of the time between two calls. Any excess is added up as
+        overtime, which shorter calls reduce again, so occasional slow calls are tolerated.
 
         Args:
             tick: Tick of the call.
-            elapsed_ns: Time that the call took, in ns.
+            elapsed_ns: Duration of the call, in ns.
 
         Raises:
             Exception: The code is too slow.
@@ -182,8 +178,8 @@ class WatchedCode:
     def describe_hiccups(self) -> str:
         """Returns a sentence about slow calls of the user's code, for the end of the run.
 
-        A call is slow if it takes longer than a period of the control loop, for example 1 ms at
-        1 kHz. The arm then receives its torque too late.
+        A call is slow if it takes longer than one tick, for example 1 ms at 1 kHz. The arm then
+        receives its torque too late.
 
         Returns:
             A sentence with the number of slow calls and the duration of the slowest. Empty if
@@ -201,13 +197,13 @@ class WatchedCode:
         """Interrupts user code that does not return, such as a law with an endless loop.
 
         A timer signal calls this method every second (`_CHECK_S`) while the code runs. If
-        several checks in a row see the same call, an error is raised inside the call, because
+        several consecutive checks see the same call, an error is raised inside the call;
         otherwise the arm would never receive another torque. A call is identified by the number
-        of finished calls before it. Checks that were missed while the process was suspended do
+        of calls completed before it. Checks that were missed while the process was suspended do
         not count.
 
         Raises:
-            Exception: The error that the constructor's argument `fail` has returned.
+            Exception: The error returned by the constructor's argument `fail`.
         """
         tick = self._running_tick
         is_running = tick >= 0
@@ -226,16 +222,17 @@ class WatchedCode:
 
 
 class CodeWatchdog:
-    """Context manager that interrupts a user's code if it hangs, such as in an endless loop.
+    """Context manager that interrupts a user's code if it hangs, as in an endless loop.
 
-    The code is watched inside the `with` block. The timer uses the signal SIGALRM, which Python
-    handles in the main thread only. In other threads, and on Windows, nothing is interrupted.
+    The code is monitored inside the `with` block. The timer uses the signal SIGALRM, which
+    Python handles only in the main thread. In other threads, and on Windows, nothing is
+    interrupted.
 
     Args:
-        *codes: The user's code to watch.
+        *codes: The user's code to monitor.
 
     Attributes:
-        codes: The code to watch. More can be added before the `with` block.
+        codes: The code to monitor. More can be added before the `with` block.
     """
 
     def __init__(self, *codes: WatchedCode) -> None:
@@ -256,9 +253,9 @@ class CodeWatchdog:
             self._handler_before = None
 
     def _check(self, _number: int, _frame: FrameType | None) -> None:
-        """Handles the timer signal SIGALRM: raises an error in a user's code that hangs.
+        """Handles the timer signal SIGALRM by raising an error in user code that hangs.
 
-        The signal arrives every `_CHECK_S`, also while the code is in an endless loop.
+        The signal arrives every `_CHECK_S`, even while the code is in an endless loop.
         """
         for code in self.codes:
             code.check()

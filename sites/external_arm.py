@@ -1,19 +1,19 @@
-"""Receives measurements of a real arm and its dead-man switch, and stops the arm without them.
+"""Monitors a real arm and its dead-man switch, and stops the arm if either falls silent.
 
-An arm is external (`plant = "external"` in the scenario) if it is a real arm, or a simulation
-in another program. Its driver sends the measured joint positions to the site, the process that
-computes the torque. A dead-man switch is a button that somebody must hold while the arm moves.
+An arm is external (`plant = "external"` in the scenario) if it is a real arm, or is simulated
+by another program. Its driver sends the measured joint positions to the site, which computes
+the torque. A dead-man switch is a button that somebody must hold while the arm moves.
 `ExternalArm` and `DeadManSwitch` measure how long each of the two has been silent, and derive
-orders for the site: to hold the position, to stop, or to continue.
+commands for the site: to hold the position, to stop, or to continue.
 
 Invariant:
     - A received message cannot raise an error in the control loop. The queue of messages is
       bounded.
     - The site does not start without a measurement. It holds its position after
       `HELD_SILENCE_NS` without a measurement, and enters the mode "fault" after
-      `SILENCE_LIMIT_NS`, because the torque would no longer fit the state of the arm.
-    - A measurement that the arm cannot have reached since the previous one is dropped, and does
-      not count as received, because the sensor or the driver must be faulty.
+      `SILENCE_LIMIT_NS`, when the torque would no longer match the state of the arm.
+    - A measurement that the arm cannot have reached since the previous one indicates a faulty
+      sensor or driver. It is dropped, and does not count as received.
     - A switch that has sent nothing for `SWITCH_SILENCE_NS` counts as released.
 """
 
@@ -31,25 +31,24 @@ from trilat_net.records import Mode
 from .site_loop import STEP_MARGIN_RAD
 
 MEASUREMENTS_KEPT = 64
-"""Number of messages in a queue. Older measurements are useless."""
+"""Number of messages that a queue can hold. Older measurements are useless."""
 HELD_SILENCE_NS = 30_000_000
-"""Silence of the arm after which the site holds its position, in ns."""
+"""Time without a measurement after which the site holds its position, in ns."""
 SILENCE_LIMIT_NS = 200_000_000
-"""Silence of the arm after which the site enters the mode "fault", in ns."""
+"""Time without a measurement after which the site enters the mode "fault", in ns."""
 SWITCH_SILENCE_NS = 100_000_000
-"""Silence of a dead-man switch after which it counts as released, in ns."""
+"""Time without a report after which a dead-man switch counts as released, in ns."""
 STARTS_KEPT = 64
-"""Number of switch programs whose state is stored.
+"""Maximum number of switch programs whose state is stored.
 
 If there are more programs, one that does not hold the switch is removed.
 """
 _START_POSE_TOLERANCE_RAD = 0.01
-"""Largest distance of the arm from its `q0_rad` at the start without a warning, in rad.
-"""
+"""Maximum distance of the arm from its `q0_rad` at the start without a warning, in rad."""
 POLL_NS = 5_000_000
-"""Time between two polls while the site waits for its arm, in ns."""
+"""Interval between polls while the site waits for its arm, in ns."""
 _MAX_POLL_GAP_NS = 20_000_000
-"""Largest silence that one poll can add, in ns.
+"""Maximum silence that one poll can add, in ns.
 
 If the site itself was suspended, it cannot know which messages it would have received.
 """
@@ -58,15 +57,15 @@ If the site itself was suspended, it cannot know which messages it would have re
 class ExternalArm:
     """Receives the measurements of one external arm, and watches for interruptions.
 
-    An external arm is a real or simulated arm outside of this program, whose driver sends the
-    joint angles and velocities. If no measurement arrives for some time, the site has to stop
-    the arm.
+    The joint angles and velocities are sent by the arm's driver. If no measurement arrives for
+    some time, the site has to stop the arm.
 
     Args:
         site: Site of the arm in the simulation kernel.
         ring: Queue of the measurements.
         clock: Clock of this machine.
-        dropped: Number of dropped measurements by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped measurements. The counts are increased
+            in place.
         address: Where the site expects the measurements, for messages to the user.
 
     Attributes:
@@ -115,7 +114,7 @@ class ExternalArm:
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the first measurement of an arm outside of this program, such as a robot.
+        """Waits for the first measurement of an external arm, such as a robot.
 
         The session cannot start without it, because the controller would not know the arm's
         pose.
@@ -126,7 +125,7 @@ class ExternalArm:
             say: Function that prints a line for the user.
 
         Returns:
-            True if a measurement has arrived. False if `stopped` returned True.
+            True if a measurement has arrived, or False if `stopped` returned True.
 
         Raises:
             SessionError: No measurement arrived in time.
@@ -152,10 +151,10 @@ class ExternalArm:
         return False
 
     def _describe_silence(self) -> SessionError:
-        """Returns the error of a site that has waited in vain for a measurement of its arm.
+        """Returns the error for a site that has waited in vain for a measurement of its arm.
 
-        The text says how many messages were dropped and why. If none has arrived, it advises
-        how to connect the driver of the arm.
+        The message says how many measurements were dropped and why. If none has arrived, it
+        explains how to connect the arm's driver.
         """
         text = f"{self._site} received no measurement from its arm on {self._address}"
         if self._dropped:
@@ -166,18 +165,17 @@ class ExternalArm:
         return SessionError(f"{text}; see {find_page('external-arm.md')}")
 
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """Checks the arm's pose. From now on, only its present driver's measurements are used.
+        """Checks the arm's pose, and binds the site to the arm's current driver.
 
-        The driver is the program that sends the joint angles of an arm outside of this program.
-        The site that controls the arm calls this method at the start of the session.
-        Measurements that another program sends later are dropped.
+        The site calls this method at the start of the session. Measurements that another
+        program sends later are dropped.
 
         Args:
             q0_rad: Joint angles in rad at which the arm starts according to the scenario. The
                 other sites assume this pose.
 
         Returns:
-            A warning if the arm is not at this pose. Empty if it is.
+            A warning if the arm is not in this pose, or an empty string if it is.
         """
         self.poll()
         self._is_bound = True
@@ -195,10 +193,10 @@ class ExternalArm:
         )
 
     def poll(self) -> None:
-        """Receives measurements of an arm outside of this program, and detects its silence.
+        """Receives measurements of an external arm, and detects if they stop arriving.
 
-        The silence is the time since the last accepted measurement. The control loop calls this
-        method in every tick (period).
+        The control loop calls this method in every tick, and measures the time since the last
+        accepted measurement.
         """
         now_ns = self._clock.monotonic_ns()
         accepted_before = self.accepted
@@ -216,13 +214,13 @@ class ExternalArm:
         self._polled_ns = now_ns
 
     def pop_order(self, mode: Mode) -> SiteOrder:
-        """Returns the order with which the control loop reacts to missing measurements.
+        """Returns the command with which the control loop reacts to missing measurements.
 
-        Another order follows when measurements arrive again. Each order is returned once,
+        Another command follows when measurements arrive again. Each command is returned once,
         except that "arm_lost" is repeated until the site is in the mode "fault".
 
         Args:
-            mode: Present mode of the site.
+            mode: Current mode of the site.
 
         Returns:
             "arm_silent" to hold the position, after `HELD_SILENCE_NS` without a measurement.
@@ -245,12 +243,12 @@ class ExternalArm:
         return "arm_back" if previous_order == "arm_silent" else ""
 
     def _accept(self, payload: bytes) -> None:
-        """Checks one measurement, and stores it or counts the reason why it is dropped.
+        """Checks one measurement, and either stores it or counts the reason why it is dropped.
 
         A measurement names its site, the boot of the driver (a random number that identifies
-        the start of its process), and a sequence number n, which the driver increases by one.
-        The measurement is dropped if it belongs to another site or driver, is not newer than
-        the stored one, or is implausible because the arm cannot have moved so far.
+        the start of its process), and a sequence number n, which the driver increments. The
+        measurement is dropped if it belongs to another site or driver, is not newer than the
+        stored one, or is implausible because the arm cannot have moved so far.
 
         Args:
             payload: The encoded measurement.
@@ -297,8 +295,8 @@ class ExternalArm:
     def _is_plausible(self, q: Sequence[float], elapsed_s: float) -> bool:
         """Returns True if each joint can have moved to its angle since the last measurement.
 
-        A larger movement would exceed the speed limits of the arm, so the sensor or the driver
-        must be faulty.
+        A larger movement would exceed the speed limits of the arm, which indicates a faulty
+        sensor or driver.
 
         Args:
             q: Joint angles in rad.
@@ -315,15 +313,14 @@ class ExternalArm:
 class _Holder:
     """Newest report of one program on whether its user holds the dead-man switch of an arm.
 
-    An external arm (one outside of this program) moves only while somebody holds this switch,
-    for safety. Several programs may report for one arm.
+    Several programs may report for one arm.
 
     Attributes:
-        n: Number of its newest message.
-        pressed_ns: Time at which its newest report of a held switch arrived, in ns. None if it
-            does not hold the switch.
-        counts: False if another program has released the switch while this program held it.
-            The switch of this program then has to be released and pressed again.
+        n: Number of the program's newest message.
+        pressed_ns: Time at which the program's newest report of a held switch arrived, in ns.
+            None if it does not hold the switch.
+        counts: False if another program has released the switch while this program held it. The
+            switch of this program then has to be released and pressed again.
     """
 
     n: int = -1
@@ -332,20 +329,21 @@ class _Holder:
 
 
 class DeadManSwitch:
-    """State of the dead-man switch of one arm, for which several programs may report.
+    """State of the dead-man switch of one arm, which several programs may report.
 
     A person holds the switch while the arm may move. Releasing it stops the arm.
 
     The arm stops if any program that holds the switch releases it or falls silent. The others
-    then have to release the switch and press it again. The age of a message is measured on the
-    clock of this machine from its arrival. The switch therefore counts as released if this
-    process was suspended.
+    then have to release the switch and press it again. The age of a report is measured from its
+    arrival, on the clock of this machine, so the switch counts as released if this process was
+    suspended.
 
     Args:
         site: Name of the site of the arm.
-        ring: Queue of the reports, with the times of their arrival.
+        ring: Queue of the reports, with their times of arrival.
         clock: Clock of this machine.
-        dropped: Number of dropped messages by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped messages. The counts are increased in
+            place.
     """
 
     def __init__(
@@ -363,7 +361,7 @@ class DeadManSwitch:
         self._was_released = False
 
     def _list_holders(self) -> list[_Holder]:
-        """Lists the programs whose dead-man switch is pressed and counts.
+        """Lists the programs whose dead-man switch is pressed and counts as held.
 
         After any program has released the switch, all programs must release it and press it
         again, so that nobody restarts an arm by accident.
@@ -377,8 +375,8 @@ class DeadManSwitch:
     def _is_silent(self, holder: _Holder) -> bool:
         """Returns True if a program has not reported a pressed switch for `SWITCH_SILENCE_NS`.
 
-        If the program held the switch, the arm then stops. A program that does not press the
-        switch counts as silent.
+        If the program was holding the switch, the arm then stops. A program that does not press
+        the switch counts as silent.
         """
         if holder.pressed_ns is None:
             return True
@@ -386,7 +384,7 @@ class DeadManSwitch:
 
     @property
     def held(self) -> bool:
-        """True if the dead-man switch is held, so that the arm may move.
+        """True if the dead-man switch is held and the arm may move.
 
         At least one program must report that a person holds the switch, and no program that has
         reported this may have been silent for longer than `SWITCH_SILENCE_NS`.
@@ -397,8 +395,8 @@ class DeadManSwitch:
     def poll(self) -> None:
         """Receives reports about the dead-man switch, and updates whether it is held.
 
-        If a program that holds the switch has been silent for too long, the switch counts as
-        released, because the program may have crashed.
+        If a program that holds the switch has been silent for too long, it may have crashed,
+        and the switch counts as released.
         """
         while (message := self._ring.poll()) is not None:
             payload, received_ns = message
@@ -406,19 +404,18 @@ class DeadManSwitch:
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns the order that follows from the dead-man switch: to stop, or to move again.
+        """Returns the command that follows from the dead-man switch: to stop, or to move again.
 
-        A dead-man switch is a button that a person holds while the arm may move. While the
-        switch is released, every call returns the order to stop, until the arm has stopped for
-        this reason or its site reports a fault.
+        While the switch is released, every call returns the command to stop, until the arm has
+        stopped for this reason or its site reports a fault.
 
         Args:
-            mode: Present mode of the site, for example stopped.
+            mode: Current mode of the site, for example stopped.
             reason: Reason why the site is in this mode.
 
         Returns:
-            "released" if the arm must stop. "held" if it may move again. Empty if the site need
-            not do anything.
+            "released" if the arm must stop, "held" if it may move again, or an empty string if
+            the site does not have to do anything.
         """
         was_released = self._was_released
         self._was_released = False
@@ -432,13 +429,13 @@ class DeadManSwitch:
         return "held" if is_stopped_by_switch else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
-        """Marks the dead-man switch of the arm as released, so that the arm stops.
+        """Marks the dead-man switch of the arm as released, which stops the arm.
 
-        Programs that still hold the switch must release it and press it again. In this way,
-        nobody can accidentally restart an arm that somebody else has stopped.
+        Programs that still hold the switch must release it and press it again. This prevents
+        anybody from accidentally restarting an arm that somebody else has stopped.
 
         Args:
-            released: The programs that have released it or are silent. If there are none,
+            released: The programs that have released the switch or are silent. If empty,
                 nothing changes.
         """
         if not released:
@@ -450,7 +447,7 @@ class DeadManSwitch:
         self._was_released = True
 
     def _accept(self, payload: bytes, received_ns: int) -> None:
-        """Checks one report of a program, and updates whether that program holds the switch.
+        """Checks one report from a program, and updates whether that program holds the switch.
 
         Several programs may report about the switch of one arm. If one of them releases it, the
         switch is released, and the others must release it and press it again before they count
@@ -498,8 +495,8 @@ class DeadManSwitch:
     def _forget_program(self) -> None:
         """Removes the oldest program from the list of switch holders, to make room for another.
 
-        Every program that reports on the dead-man switch has an entry, and their number is
-        limited. Programs that do not press the switch are removed before those that do.
+        The list has one entry per program that reports on the dead-man switch, and is limited
+        in length. Programs that do not press the switch are removed before those that do.
         """
         idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
         oldest = idle[0] if idle else next(iter(self._programs))

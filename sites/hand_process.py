@@ -1,13 +1,12 @@
 """Runs a user's operator class, which decides how to move an arm, in a separate process.
 
-The method `act` of the class receives a view, which is the present state of the arm and of the
-others, and returns a target or a force. The process of the arm sends views over the network at
-regular intervals. This process, the command `trilat hand`, replies with the decisions of the
-class.
+The class has a method `act` that receives a view (the current state of the arm and of the
+others) and returns a target or a force. The site sends views over the network at regular
+intervals. This process, started by `trilat hand`, replies with the decisions of the class.
 
 Invariant:
-    - Each decision names the tick of its view. It takes effect a fixed time after that tick, so
-      that delays on the network do not change the run.
+    - Each decision names the tick of its view, and takes effect a fixed time after that tick.
+      Delays on the network therefore do not change the run.
     - Views that are too old to be answered in time are skipped, so that a slow class does not
       fall further and further behind.
     - If the class fails, the arm is released and the process ends. If the process is killed,
@@ -43,28 +42,27 @@ from trilat_net.scenario import HandSite, Scenario
 from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000
-"""Time between two polls for views, in ns."""
+"""Interval between polls for views, in ns."""
 _ANNOUNCE_PERIOD_NS = 100_000_000
-"""Time between two announcements to the site before the first view has arrived, in ns."""
+"""Interval between announcements to the site until the first view arrives, in ns."""
 _VIEWS_KEPT = 64
-"""Number of views that the network queue holds."""
+"""Number of views that the network queue can hold."""
 
 
 class HandProcess(SiteClient):
-    """Runs an operator class that a user wrote, and connects it with the arm that it moves.
+    """Runs a user's operator class, and connects it to the arm that it moves.
 
-    The arm is controlled by another process, its site. The caller calls `serve` repeatedly.
-    Each call replies to one view, a state that the site has sent.
+    The caller calls `serve` repeatedly. Each call replies to one view sent by the site.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.
-        program: The operator, an object of the user's class.
+        program: The operator, an instance of the user's class.
         bus: Network connection to the session.
         clock: Clock of this process.
         session: Name of the session.
 
     Attributes:
-        answered: Number of views (states that the site sent) to which the class has replied.
+        answered: Number of views to which the class has replied.
         skipped: Number of views that were skipped because they were too old.
     """
 
@@ -97,10 +95,9 @@ class HandProcess(SiteClient):
     def serve(self) -> None:
         """Calls the user's operator class with a view of the arm, and sends the decision.
 
-        The site of the arm regularly sends a view, which describes its present state. The
-        oldest waiting view that is not too old is used. If no view is waiting, nothing is
-        decided. Until the first view arrives, the method regularly tells the site that this
-        process exists.
+        The oldest pending view that is not too old is used. If there is none, the class is not
+        called. Until the first view arrives, this method regularly announces the process to the
+        site.
 
         Raises:
             RunFailed: The user's class failed. The arm has been released.
@@ -120,14 +117,14 @@ class HandProcess(SiteClient):
             self._send(0, None)  # a message without a decision announces this process
 
     def _decide(self, message: HandViewMessage) -> None:
-        """Calls the user's operator class with the newest state, and sends its reply to a site.
+        """Calls the user's operator class with the newest view, and sends its reply.
 
-        The site is the process that controls the arm. The reply states how to move the arm. If
-        the class fails, the arm is released at once, because nothing guides it any more.
+        The reply states how to move the arm. If the class fails, the arm is released at once,
+        because nothing is guiding it any more.
 
         Args:
-            message: The view, the present state of the arm and the others, as received from the
-                site.
+            message: The view received from the site: the current state of the arm and of the
+                others.
 
         Raises:
             RunFailed: The class failed. The arm has been released.
@@ -150,8 +147,8 @@ class HandProcess(SiteClient):
     def _send(self, view_tick: int, goal: list[float] | None) -> None:
         """Sends the decision of the class to the site.
 
-        The message states to which view (state of the arm) the decision refers, so that the
-        site can apply it at the right time.
+        The message names the view on which the decision is based, which allows the site to
+        apply it at the right time.
 
         Args:
             view_tick: Tick of the view.
@@ -165,27 +162,23 @@ class HandProcess(SiteClient):
 def _read_view(message: HandViewMessage) -> HandView:
     """Converts a network message to the object that a user's operator class receives.
 
-    The object has the joint angles and other numbers as NumPy arrays, which user code expects.
+    Joint angles and other vectors become NumPy arrays, as expected by user code.
 
     Args:
-        message: The message, which the site sends so that the user's operator class can decide
-            how to move the arm.
-
-    Returns:
-        The state of the site. Its lists of numbers are arrays.
+        message: The view sent by the site.
     """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:
-        """Reads the fields of a message that have given names, with lists converted to arrays.
+        """Reads the given fields of a message, and converts lists to arrays.
 
         The field "peers" is left out, because it is converted separately.
 
         Args:
-            source: The message, or its part that describes one peer (another site).
+            source: The message, or the part of it that describes one peer.
             names: Names of the fields.
 
         Returns:
-            The values by the names of the fields.
+            A mapping from field name to value.
         """
         fields = {}
         for name in names:
@@ -207,24 +200,24 @@ def run_hand(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Runs a user's operator class until the session ends, in a process of its own.
+    """Runs a user's operator class in its own process until the session ends.
 
     An operator class is Python code that moves an arm in place of a person. It receives the
-    state of the arm over the network, and replies with a torque or a target. In its own
-    process, it cannot delay the control loop of the arm.
+    state of the arm over the network, and replies with a force or a target. Running it in a
+    separate process prevents it from delaying the control loop of the arm.
 
     Args:
-        scenario: Scenario (description) of the session. It names the operator class.
-        name: Name of the site, the process that controls the arm.
+        scenario: Scenario of the session, which names the operator class.
+        name: Name of the site.
         session: Name of the session.
         connection: Network addresses of the session, and keys.
         interrupt: Handler of the signals of this process.
         say: Function that prints a line for the user.
-        timeout_s: Longest wait for the first message with the state of the site, in s.
+        timeout_s: Longest wait for the first view from the site, in s.
 
     Raises:
-        UsageError: The scenario has no operator class for this site that runs in a process of
-            its own.
+        UsageError: For this site, the scenario has no operator class that runs in its own
+            process.
         SessionError: The site does not send its state in time.
         RunFailed: The class failed.
     """

@@ -1,16 +1,16 @@
-"""Receives, at the process of an arm, the commands of the operator who moves the arm.
+"""Receives the commands of the operator who moves an arm, in the process of the arm's site.
 
-An operator is a person or a program, and commands a target position or a force by messages over
+An operator is a person or a program that sends messages with a target position or a force over
 the network. `HandServer` receives the commands of people and programs that connect to the
-session. `RemoteHand` receives those of a Python class of the user that runs in a process of its
-own, and sends the state of the arm to that process.
+session. `RemoteHand` receives those of a user's Python class that runs in its own process, and
+sends the state of the arm to that process.
 
 Invariant:
-    - A message cannot raise an error in the control loop, and each tick reads a limited number
-      of messages, so that many messages do not make a tick late. Refused messages are counted
-      by reason.
+    - A message cannot raise an error in the control loop. Each tick reads a limited number of
+      messages, so a flood of messages does not delay it. Rejected messages are counted per
+      reason.
     - Only one operator at a time moves the arm, and the site limits the motion of the target as
-      the scenario says. The sender of a message cannot circumvent these rules.
+      specified in the scenario. The sender of a message cannot circumvent these rules.
 """
 
 import math
@@ -32,12 +32,12 @@ from trilat_net.net import Clock, HandMessage, HandViewMessage, Inbox, PeerSeen,
 from trilat_net.scenario import ArmModel, HandPlayer, HandSite, LiveHand
 
 MESSAGES_KEPT = 32
-"""Number of messages in the queue, and largest number of messages that a tick reads.
+"""Number of messages that the queue can hold, and maximum number read in one tick.
 
 If the queue is full, the oldest message is dropped.
 """
 POLL_NS = 5_000_000
-"""Time between two polls while the site waits for the operator's process, in ns."""
+"""Interval between polls while the site waits for the operator's process, in ns."""
 
 
 def _read_messages(
@@ -46,15 +46,16 @@ def _read_messages(
     dropped: Counter[str],
     source: str | None = None,
 ) -> Iterator[HandMessage]:
-    """Yields the messages of an operator that have arrived, and counts those that are dropped.
+    """Yields an operator's messages that have arrived, and counts those that are dropped.
 
-    A limited number is read in each tick of the control loop, so that many messages do not
-    delay it.
+    Only a limited number is read in each tick, so that a flood of messages does not delay the
+    control loop.
 
     Args:
         inbox: Queue of the messages.
         site: Name of the site to which the messages must be addressed.
-        dropped: Number of dropped messages by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped messages. The counts are increased in
+            place.
         source: Only accepted sender. If None, all senders are accepted.
     """
     for _ in range(MESSAGES_KEPT):
@@ -78,15 +79,15 @@ def _read_messages(
 class HandServer:
     """Moves the arm of a site as requested by people and programs that connect to the session.
 
-    A site is the process that controls one arm. Each of these people and programs is an
-    operator. Only one operator moves the arm at a time.
+    Only one of these operators can move the arm at a time.
 
     Args:
-        site: Object that computes the ticks (control periods) of the site.
+        site: Object that computes the ticks of the site.
         hand: Settings in the scenario for operators that connect during the session.
         arm: Arm of the site.
         inbox: Queue of the operators' messages.
-        dropped: Number of dropped messages by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped messages. The counts are increased in
+            place.
         limits: Limits of the motion of the site. None if there are none.
 
     Attributes:
@@ -119,17 +120,16 @@ class HandServer:
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, tick: int) -> list[float]:
-        """Reads the waiting messages of operators, and returns how to move the arm.
+        """Processes the pending messages of operators, and returns how to move the arm.
 
-        An operator is a person or a program that moves the arm by messages over the network.
-        The control loop calls this in every tick.
+        The control loop calls this method in every tick.
 
         Args:
-            tick: Number of the tick, a period of the control loop.
+            tick: Number of the tick.
 
         Returns:
-            The operator who moves the arm, and the target or force, as a list of numbers for
-            the computation of the tick. `HandInForce.read` describes the numbers.
+            The operator who moves the arm, and the target or force, as a list of floats for the
+            computation of the tick. The format is described in `HandInForce.read`.
         """
         messages = _read_messages(self._inbox, self._site, self._dropped)
         parsed = [self._parse_command(message) for message in messages]
@@ -156,17 +156,17 @@ class HandServer:
         return step.vector
 
     def _parse_command(self, message: HandMessage) -> HandCommand | None:
-        """Checks a message of an operator who moves the arm, and converts it to a command.
+        """Checks a message from an operator who moves the arm, and converts it to a command.
 
-        The goal of the operator is either a target position or a force, as the scenario says. A
+        The operator's goal is either a target position or a force, depending on the scenario. A
         message without a grip releases the arm.
 
         Args:
             message: The message.
 
         Returns:
-            The command. None if the message is refused, because it contains a force instead of
-            a target or the reverse, has a wrong number of coordinates, or is out of range.
+            The command, or None if the message is rejected: because it contains a force instead
+            of a target or vice versa, has the wrong number of coordinates, or is out of range.
         """
         if self._hand.mode == "force":
             noun = "force"
@@ -203,19 +203,18 @@ class HandServer:
 class RemoteHand(HandPlayer):
     """Moves the arm of a site as decided by a user's Python class in another process.
 
-    At regular intervals, the site sends the process a view, which is the present state of the
-    site. The process replies with its decision: a target, a force, or to release the arm. The
-    decision takes effect a fixed time after the tick of the view. If it arrives too late, it
-    takes effect at once and is counted. Only decisions of the class that the scenario names are
-    accepted.
+    At regular intervals, the site sends a view (its current state) to that process. The process
+    replies with its decision: a target, a force, or to release the arm. The decision takes
+    effect a fixed time after the tick of the view. If it arrives too late, it takes effect at
+    once and is counted. Only decisions of the class named in the scenario are accepted.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.
         boot: Random number that identifies this start of the site.
         inbox: Queue of the decisions.
         publish: Function that publishes a view.
-        dropped: Number of dropped and late messages by reason. The counts are increased in
-            place.
+        dropped: Mapping from reason to number of dropped and late messages. The counts are
+            increased in place.
         clock: Clock of this process.
     """
 
@@ -240,15 +239,15 @@ class RemoteHand(HandPlayer):
     def track(self, site: Site, tick: int) -> list[float]:
         """Reads the newest decision of the user's operator class on how to move the arm.
 
-        The class runs in a process of its own. The control loop calls this in every tick.
+        The control loop calls this method in every tick.
 
         Args:
             site: Object that computes the ticks of the site.
-            tick: Number of the tick, a period of the control loop.
+            tick: Number of the tick.
 
         Returns:
-            The target or force on the arm, as a list of numbers for the computation of the
-            tick. `HandInForce.read` describes the numbers.
+            The target or force on the arm, as a list of floats for the computation of the tick.
+            The format is described in `HandInForce.read`.
         """
         for message in self._read_decisions():
             self._decide(tick, message)
@@ -257,11 +256,10 @@ class RemoteHand(HandPlayer):
     def request_action(self, tick: int, arrays: SiteArrays) -> None:
         """Sends the state of the arm to the user's operator class, to request a new decision.
 
-        The class runs in a process of its own. The control loop does not wait for the reply,
-        which `track` reads in a later tick.
+        The control loop does not wait for the reply, which `track` reads in a later tick.
 
         Args:
-            tick: Number of the present tick, a period of the control loop.
+            tick: Number of the current tick.
             arrays: State of the site in this tick, from which the message is composed.
         """
         view = self.view(tick, arrays)
@@ -276,7 +274,7 @@ class RemoteHand(HandPlayer):
     ) -> bool:
         """Waits until the process of the user's operator class announces itself.
 
-        A session must not start before this, because nobody could move the arm.
+        The session must not start earlier, because nobody could move the arm.
 
         Args:
             stopped: Function that returns True to end the wait.
@@ -284,7 +282,7 @@ class RemoteHand(HandPlayer):
             say: Function that prints a line for the user.
 
         Returns:
-            True if the process has announced itself. False if `stopped` returned True.
+            True if the process has announced itself, or False if `stopped` returned True.
 
         Raises:
             SessionError: The process did not announce itself in time.
@@ -303,22 +301,21 @@ class RemoteHand(HandPlayer):
     def _read_decisions(self) -> Iterator[HandMessage]:
         """Yields the received decisions of a user's operator class on how to move the arm.
 
-        The class runs in a process of its own. Invalid messages, and messages from other
-        processes, are dropped and counted.
+        Invalid messages, and messages from other processes, are dropped and counted.
         """
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, present_tick: int, message: HandMessage) -> None:
-        """Schedules a decision of the user's class, to take effect at its planned tick.
+        """Schedules a decision of the user's class to take effect at its planned tick.
 
         A decision that arrives after this tick is counted as late, and takes effect at once.
         Decisions about views that were never sent are ignored, as are all decisions after a
         failure.
 
         Args:
-            present_tick: Present tick.
+            present_tick: Current tick.
             message: The decision. Its number n refers to the view of tick n * `period_ticks`.
-                Without a grip it releases the arm.
+                Without a grip, it releases the arm.
         """
         view_tick = message.n * self.hand.period_ticks
         # The process announces itself with a message that contains no decision. It may arrive

@@ -1,8 +1,8 @@
 """Measures how late the control loop of an arm runs on this machine, without a network.
 
-`trilat doctor` uses it to find the highest tick rate that the machine achieves. A tick is one
-period of the control loop, and is late if it begins after the time at which it was due. The
-loop does the same work as in a session, except that no messages are exchanged.
+`trilat doctor` uses this module to find the highest tick rate that the machine can sustain. A
+tick is late if it begins after the time at which it was due. The loop does the same work as in
+a session, except that no messages are exchanged.
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,18 @@ from .site_loop import PeerInbox, StateBlock, run_loop
 
 
 def rehearse_loop(scenario: Scenario, name: str, clock: Clock) -> list[int]:
-    """Executes the control loop of one arm in real time, to measure how punctual it is.
+    """Runs the control loop of one arm in real time, and measures how late ticks begin.
 
-    `trilat doctor` learns from the result whether this machine is fast enough. The loop runs
+    `trilat doctor` uses the result to decide whether this machine is fast enough. The loop runs
     without other arms and without a network.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario.
         name: Name of the site.
         clock: Clock of this process.
 
     Returns:
-        The lateness of each tick, the time from its due time to its beginning, in us.
+        The time from when each tick was due until it began, in us.
     """
     return _Rehearsal(scenario, name).run(clock)
 
@@ -36,14 +36,13 @@ class _Rehearsal(LoopStats):
     """Runs the control loop of a single site without a network, to measure how late ticks are.
 
     The loop does the same work as in a session, except that no messages are exchanged. This
-    object takes the place of two objects of the loop: of its statistics, so that the lateness
-    of each tick can be stored, and of the `_LoopSite`, whose methods do nothing here.
+    object stands in for two objects of the loop: for its statistics, to store the lateness of
+    each tick, and for the `_LoopSite`, whose methods do nothing here.
 
-    A tick is one period of the control loop. It is late if it begins after the time at which it
-    was due.
+    A tick is late if it begins after the time at which it was due.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario.
         name: Name of the site.
     """
 
@@ -54,16 +53,15 @@ class _Rehearsal(LoopStats):
         self._late_us: list[int] = []
 
     def run(self, clock: Clock) -> list[int]:
-        """Executes the control loop of one arm for the scenario's duration, in real time.
+        """Runs the control loop of one arm for the scenario's duration, in real time.
 
-        This measures whether the machine is fast enough. The loop receives no messages of other
-        arms, and its results are not sent anywhere.
+        The loop receives no messages from other arms, and its results are not sent anywhere.
 
         Args:
             clock: Clock of this process.
 
         Returns:
-            The lateness of each tick, the time from its due time to its beginning, in us.
+            The time from when each tick was due until it began, in us.
         """
         boot = 1  # identifies the start of the process, which matters only in a network
         inbox_without_peers = PeerInbox(
@@ -88,42 +86,40 @@ class _Rehearsal(LoopStats):
         return self._late_us
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Stores how late one control period (tick) began, and how long it took.
+        """Stores how late one tick began.
 
-        The loop calls the method in place of `LoopStats.count_tick`.
+        Called by the loop in place of `LoopStats.count_tick`.
 
         Args:
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
-            skipped: Number of ticks (periods of the control loop) that were skipped before this
-                tick.
+            skipped: Number of ticks that were skipped before this tick.
         """
         super().count_tick(late_us, busy_us, skipped)
         self._late_us.append(late_us)
 
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord:
-        """Computes one control period (tick) of an arm without other arms, to test its timing.
+        """Computes one tick of an arm without other arms, to test its timing.
 
-        The loop calls this method in place of `_LoopSite.step`.
+        Called by the loop in place of `_LoopSite.step`.
 
         Args:
             tick: Number of the tick.
-            arrivals: Samples (states of other sites) that have arrived. Always empty in this
-                test.
+            arrivals: Samples that have arrived. Always empty in this test.
 
         Returns:
-            The record of the tick: what the site measured and computed.
+            The record of the tick.
         """
         return self._site.step(TickInput(tick, arrivals))
 
     def run_housekeeping(self, *_: object) -> bool:
         """Does nothing, because this test of the control loop has no network.
 
-        The loop calls this method after a tick, in the place where a site of a session sends
-        and receives messages.
+        Called by the loop after each tick, where the site of a session sends and receives
+        messages.
 
         Returns:
-            False, so that the loop continues.
+            False, to continue the loop.
         """
         return False
 

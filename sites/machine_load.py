@@ -1,7 +1,7 @@
 """Warns before a session if other programs keep the processors of this machine busy.
 
-On a busy machine, control loops run late. The load is measured for 0.2 s, from the statistics
-that Linux provides in /proc/stat. On other operating systems there is no warning.
+On a busy machine, control loops run late. The load is measured over 0.2 s from the statistics
+that Linux provides in /proc/stat. On other operating systems, no warning is given.
 """
 
 from contextlib import suppress
@@ -17,10 +17,10 @@ MEASURED_NS = 200_000_000
 BUSY_SHARE = 0.8
 """Fraction of busy time above which a warning is printed.
 
-A recorder has no priority, and may then receive too little computing time.
+Above it, a recorder may receive too little computing time, because it has no priority.
 """
 _STATISTICS = Path("/proc/stat")
-"""File in which Linux reports the time that the processors have spent on each kind of work."""
+"""File in which Linux reports how much time the processors have spent on each kind of work."""
 _IDLE_COLUMNS = slice(3, 5)  # idle, and waiting for a disk
 _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" includes
 
@@ -28,27 +28,27 @@ _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" incl
 def check_machine_load(clock: Clock) -> str:
     """Returns a warning if other programs keep this machine busy.
 
-    A control loop on a busy machine starts its periods late, which makes its arm move
-    differently.
+    On a busy machine, the ticks of a control loop begin late, which changes the motion of the
+    arm.
 
     Args:
         clock: Clock of this process.
 
     Returns:
-        The warning, with a remedy. Empty if the machine is not busy.
+        The warning and a remedy, or an empty string if the machine is not busy.
     """
     return _describe_load(_measure_busy_share(clock))
 
 
 class _ProcessorTimes(NamedTuple):
-    """Idle and total time of all processors since the start of the machine.
+    """Idle and total time of all processors since the machine was started.
 
-    Two readings give the load in between. The unit is the clock tick of the kernel, usually 10
-    ms.
+    Two readings give the load between them. The unit is the clock tick of the kernel, usually
+    10 ms.
 
     Attributes:
-        idle: Time without work, summed over the processors.
-        total: Time with and without work, summed over the processors.
+        idle: Idle time, summed over the processors.
+        total: Idle and busy time, summed over the processors.
     """
 
     idle: int
@@ -56,9 +56,9 @@ class _ProcessorTimes(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "_ProcessorTimes":
-        """Reads the idle and total processor times from the content of /proc/stat of Linux.
+        """Parses the idle and total processor times from the content of /proc/stat on Linux.
 
-        The first line of the file is used, which is the sum of all processors, see
+        The first line of the file is used, which is the sum over all processors, see
         proc_stat(5).
 
         Args:
@@ -69,16 +69,15 @@ class _ProcessorTimes(NamedTuple):
 
 
 def _measure_busy_share(clock: Clock) -> float | None:
-    """Measures the fraction of time in which the processors of this machine are busy.
+    """Measures the fraction of time during which the processors of this machine are busy.
 
-    It is for example 0.25 if one of four processors is always busy. On a busy machine, control
-    loops may begin their periods too late.
+    For example, it is 0.25 if one of four processors is always busy.
 
     Args:
         clock: Clock of this process.
 
     Returns:
-        The fraction between 0 and 1. None if the operating system does not report it.
+        The fraction, between 0 and 1, or None if the operating system does not report it.
     """
     with suppress(OSError, ValueError, IndexError):
         before = _ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
@@ -94,13 +93,13 @@ def _measure_busy_share(clock: Clock) -> float | None:
 def _describe_load(busy_share: float | None) -> str:
     """Returns a warning with a remedy if other programs keep the machine busy.
 
-    On a busy machine, control loops may begin their periods too late.
+    On a busy machine, the ticks of control loops may begin too late.
 
     Args:
-        busy_share: Fraction of time in which the processors are busy. None if it is not known.
+        busy_share: Fraction of time during which the processors are busy. None if unknown.
 
     Returns:
-        The warning. Empty if the machine has time left, or if the load is not known.
+        The warning. Empty if the machine has time to spare, or if the load is unknown.
     """
     if busy_share is None or busy_share < BUSY_SHARE:
         return ""

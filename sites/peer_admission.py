@@ -1,14 +1,13 @@
 """Admits arms that join or rejoin a running session, and notices arms that stay away.
 
-Each arm is controlled by a process of its own, its site. If such a process has crashed and is
-started again, the other sites must know the first tick from which to use its messages. The
-modules `peer_monitor` and `peer_admission` share this work: the first notices processes, the
-second changes whose samples the control loop uses.
+If a site has crashed and is restarted, the other sites must know the first tick from which to
+use its messages. `peer_monitor` and `peer_admission` share this work: the former detects
+processes, the latter changes whose samples the control loop uses.
 
 Invariant:
-    - From the tick that an admitted peer has announced, samples of its new process are
-      accepted. Samples of its previous process are not accepted any more.
-    - A peer whose samples arrive counts as present, even if its token in the network was lost.
+    - From the tick announced by an admitted peer, samples from its new process are accepted,
+      and samples from its previous process are rejected.
+    - A peer whose samples arrive counts as present, even if its liveliness token was lost.
 """
 
 from msgspec.structs import asdict
@@ -22,22 +21,20 @@ from .site_parts import SiteParts
 
 
 class PeerAdmission:
-    """Decides, in a running session, from which tick the samples of a restarted peer are used.
+    """Decides from which tick onwards the samples of a restarted peer are used.
 
-    The process of a peer may crash and be started again. Samples of its old process that are
-    still in transit must then not be mixed with those of the new one.
-
-    A peer is another site of the session.
+    Samples of the old process that are still in transit must not be mixed with those of the new
+    one.
 
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
         epoch: Common start time of the session, and the request of this site if it joined late.
         timing: Clocks of the peers.
-        inbox: Samples of the peers.
+        inbox: Samples from the peers.
 
     Attributes:
-        has_given_up: True if a peer has been away for longer than the user permits.
+        has_given_up: True if a peer has been away for longer than the user allows.
     """
 
     def __init__(
@@ -59,7 +56,7 @@ class PeerAdmission:
     def watch_members(self, t_ns: int) -> None:
         """Updates who takes part in the session, and checks if a peer is away for too long.
 
-        A member is present while its token exists in the network, which the monitor observes.
+        A member is present while its liveliness token exists, which is observed by the monitor.
         The monitor also collects the events of new processes of peers that may join.
 
         Args:
@@ -88,10 +85,10 @@ class PeerAdmission:
         self.has_given_up = self._is_peer_away_too_long(t_ns)  # ends the loop
 
     def _is_peer_away_too_long(self, t_ns: int) -> bool:
-        """Returns True if another arm's process left longer ago than the user permits.
+        """Returns True if a peer left longer ago than the user allows, which ends the run.
 
-        The run then ends. The limit is the option `leave_timeout_s`. Without this option, a
-        process may stay away forever.
+        The limit is the option `leave_timeout_s`. Without this option, a peer may stay away
+        forever.
 
         Args:
             t_ns: Present time, ns since the epoch.
@@ -104,14 +101,13 @@ class PeerAdmission:
         return t_ns - first_left_ns > patience_s * NS_PER_S
 
     def _admit_peer(self, event: Event, t_ns: int) -> None:
-        """Prepares this site for a peer (another site) that joins or rejoins the session.
+        """Prepares this site for a peer that joins the session, or rejoins it after a restart.
 
-        A peer rejoins after its process was restarted. From the tick that the event names,
-        samples of the new process are accepted, and samples of its previous process are not
-        accepted any more.
+        From the tick named in the event, samples from the new process are accepted, and samples
+        from its previous process are rejected.
 
         Args:
-            event: Event with which the peer announced its join.
+            event: Event with which the peer announced that it joins.
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         parts = self._parts
@@ -131,11 +127,11 @@ class PeerAdmission:
         """Publishes the last tick that was received from a peer before the peer was restarted.
 
         The previous process of the peer may have been killed before it could publish its end.
-        From its last tick, the recorder knows how many records (results of ticks) to expect.
+        Its last tick tells the recorder how many records to expect.
 
         Args:
             index: Index of the peer.
-            coming: Event with which the new process of the peer announced its join.
+            coming: Event with which the new process of the peer announced that it joins.
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         tick = self._inbox.find_last_tick_of(index, coming.boot)
@@ -156,7 +152,8 @@ class PeerAdmission:
 
         A peer whose connection was interrupted has not received the request, and drops the
         samples of this site as those of an unknown process. The request is repeated at most
-        once a second, until every peer whose samples arrive has confirmed samples of this site.
+        once per second, until every peer whose samples arrive has acknowledged samples of this
+        site.
 
         Args:
             t_ns: Present time, in ns since the epoch (the common start of the session).

@@ -1,12 +1,11 @@
-"""Follows which processes join a session, leave it, and end, while an arm is running.
+"""Keeps track of which processes join, leave and end a session while an arm is running.
 
-The members of a session are the sites, processes that control one arm each, and the recorders.
-A process draws a random number at its start, which distinguishes it from earlier and later
-processes with the same name.
+The members of a session are sites and recorders. Each process draws a random number at its
+start, which distinguishes it from earlier and later processes with the same name.
 
-A site learns about the other members in two ways. They publish events. In addition, each has a
-liveliness token in the network (Zenoh), which disappears when the process ends or its
-connection is lost.
+A site learns about the other members in two ways: through the events that they publish, and
+through their liveliness tokens in the network (Zenoh). A token disappears when its process ends
+or loses its connection.
 
 Invariant:
     - Two processes never act as the same site. A new process of a site is admitted only after
@@ -28,35 +27,34 @@ RETURN_NS = 1_000_000_000
 After a reconnection, samples may arrive before the new liveliness token.
 """
 _INBOX_CAPACITY = 256
-"""Largest number of events of a member that wait to be read."""
+"""Maximum number of unread events from one member."""
 
 
 class PeerMonitor:
     """Keeps track of the other members of a session for one site.
 
-    A site is the process that controls one arm, and a recorder is the process that writes the
-    log. Processes may crash, join late or be restarted while the arm runs.
-
-    The site calls `watch` ten times a second, and reads the attributes.
+    Processes may crash, join late or be restarted while the arm is running. The site calls
+    `watch` ten times per second, and reads the attributes.
 
     Args:
         bus: Network connection of the site.
         session: Name of the session.
         site: Name of the site.
-        peers: Names of its peers, the sites whose samples it receives.
+        peers: Names of its peers.
         admits: True if the scenario lets sites leave a running session and come back.
 
     Attributes:
-        boots: Boot (number of the process start) of each member of the session, by name.
-        recorders: Boots of the recorders (processes that store the log) that are present.
-        stored: Boots of the recorders that have stored all messages of this site.
-        ended_by: Sentence of the event with which a member ended the run for all. Empty if
+        boots: Mapping from the name of each member of the session to its boot (the number of
+            the process start).
+        recorders: Boots of the recorders that are present.
+        stored: Boots of the recorders that have stored all messages from this site.
+        ended_by: Sentence of the event with which a member ended the run for everyone. Empty if
             there is none.
         ended_member: Name of that member.
-        departed: For each site that has left, by its name: the time in ns since the epoch (the
-            common start of the session), and a sentence for the user.
-        admitted: Events with which sites announced their join, and that the site must still
-            apply.
+        departed: For each site that has left, the time in ns since the epoch (the common start
+            of the session) and a sentence for the user, keyed by name.
+        admitted: Events with which sites announced that they join, and which this site must
+            still apply.
         changed: True once a peer has published a change of its settings.
     """
 
@@ -100,19 +98,17 @@ class PeerMonitor:
 
     @property
     def all_stored(self) -> bool:
-        """True if every recorder that is present has stored all messages of this site.
+        """True if every recorder that is present has stored all messages from this site.
 
-        It is False if no recorder is present. The site, the process that controls the arm, may
-        then not end without losing data.
+        False if no recorder is present. Data may be lost if the site ends while this is False.
         """
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
         """Updates the list of members, and publishes an event for each that joins or leaves.
 
-        A member is a process of the session: a site (process that runs one arm) or a recorder.
-        The control loop calls this ten times a second, so that crashed processes are noticed
-        soon.
+        The control loop calls this method ten times per second, so that crashed processes are
+        noticed quickly.
 
         Args:
             publisher: Publishes the events of this site.
@@ -137,17 +133,17 @@ class PeerMonitor:
     ) -> None:
         """Updates which processes are present after a token has appeared or disappeared.
 
-        A token shows that one process is connected. The process belongs to a recorder or a
-        site. It need not be the one that is a member of the session, because a process that
-        waits to join, or that was replaced, also has a token.
+        A token shows that one process of a recorder or a site is connected. This is not
+        necessarily the process that is a member of the session, because a process that is
+        waiting to join, or that was replaced, also has a token.
 
         The method updates `recorders` and the sites whose tokens exist. If the process is a
-        member, or any recorder, it also publishes its appearance or loss, and updates
-        `departed`.
+        member, or any recorder, its appearance or loss is also published, and `departed` is
+        updated.
 
         Args:
             member: Name of the member.
-            boot: Number that identifies the start of the member's process, as text.
+            boot: Number that identifies the start of the member's process, as a string.
             publisher: Publishes the events of this site.
             t_ns: Present time, in ns since the epoch (the common start of the session).
             alive: True if the token has appeared.
@@ -178,7 +174,7 @@ class PeerMonitor:
                 self.departed[member] = (t_ns, sentence)
 
     def mark_present(self, member: str, t_ns: int) -> None:
-        """Marks a site as present because its samples arrive, although it seemed to be lost.
+        """Marks a site that seemed to be lost as present, because its samples are arriving.
 
         A site that has published its end is not marked. Neither is a site that has just left,
         because its last samples may still arrive.
@@ -196,14 +192,14 @@ class PeerMonitor:
     def _read_peer_events(
         self, inbox: Inbox, publisher: EventPublisher, t_ns: int
     ) -> Iterator[Event]:
-        """Receives the events of another arm's process, and applies events about this process.
+        """Processes the events of a peer, and applies those that are about this process.
 
-        If the other process has admitted another start of this site, this process has been
-        replaced and must end. If it has admitted several starts, the last one counts: the
-        earlier ones died while they joined.
+        If the peer has admitted another start of this site, this process has been replaced and
+        must end. If the peer has admitted several starts, the last one counts: the earlier ones
+        died while joining.
 
         Args:
-            inbox: Queue of the events of the peer.
+            inbox: Queue of the events from the peer.
             publisher: Publishes the events of this site.
             t_ns: Present time, in ns since the epoch (the common start of the session).
 
@@ -242,15 +238,15 @@ class PeerMonitor:
             self.ended_member = self._site
 
     def _decide_on_join(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        """Admits a new process of a site, or refuses it while the previous one still runs.
+        """Admits a new process of a site, or rejects it while the previous one still runs.
 
-        A boot is the number that identifies the start of a process. The previous process still
-        runs if its token exists in the network and it has not published its end.
+        The previous process is still running if its liveliness token exists and it has not
+        published its end.
 
         Args:
             publisher: Publishes the events of this site.
             event: Event with which the new process requests to join. It names the boot of the
-                process and its first tick (`ticks`).
+                process (the number that identifies its start) and its first tick (`ticks`).
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         member = event.member
@@ -288,10 +284,9 @@ class PeerMonitor:
         event: Event,
         t_ns: int,
     ) -> None:
-        """Announces whether a restarted process of another arm may join the session again.
+        """Announces whether the restarted process of a peer may rejoin the session.
 
-        The other sites and the recorder learn the decision from this event, and the new process
-        from the other sites. A site is a process that controls one arm.
+        This event informs the new process, the other sites and the recorder of the decision.
 
         Args:
             kind: Kind of the event: "admit" or "refused".
@@ -311,16 +306,16 @@ class PeerMonitor:
         )
 
     def read_stored(self, ticks: int) -> bool:
-        """Receives the messages in which recorders confirm that they have stored all data.
+        """Processes the messages in which recorders confirm that they have stored all data.
 
-        After the run, the process of the arm waits for them, because recorders may request lost
-        messages again until then.
+        After the run, the site waits for these confirmations, because until then recorders may
+        still request lost messages.
 
         Args:
-            ticks: Number of ticks (periods of the control loop) that this site has executed.
+            ticks: Number of ticks that this site has executed.
 
         Returns:
-            True if at least one further recorder has confirmed since the last call.
+            True if at least one more recorder has confirmed since the last call.
         """
         confirmed_before = len(self.stored)
         for event in read_messages(self._recorder_events, Event):
@@ -333,7 +328,7 @@ class PeerMonitor:
 def _set_membership(members: set[T], member: T, is_present: bool) -> None:
     """Adds a member to a set if it is present on the network, and removes it otherwise.
 
-    The network may report the same presence twice. The second report changes nothing.
+    The network may report the same presence twice. The second report has no effect.
     """
     if is_present:
         members.add(member)

@@ -1,11 +1,11 @@
 """Requests real-time settings from the operating system, such as priority and locked memory.
 
-A tick is one period of the control loop of an arm, and must start at a given time. The settings
-reduce the time by which ticks are late: binding to a processor, precise sleeping (timer slack),
-memory that is not swapped to disk, real-time scheduling, and no garbage collection.
+The ticks of an arm's control loop must start on time. The settings reduce how late they start:
+pinning to a processor, precise sleeping (timer slack), memory that is not swapped to disk,
+real-time scheduling, and no garbage collection.
 
 Invariant:
-    - If the operating system refuses a setting, the site continues without it.
+    - If the operating system denies a setting, the site continues without it.
     - The log contains the settings that each site has obtained, because they explain how
       punctual its ticks are.
 """
@@ -19,7 +19,7 @@ from trilat_net import process
 from trilat_net.errors import count_nouns
 
 _SITES_PER_PROCESSOR = 2
-"""Largest number of loops per processor that receive priority.
+"""Maximum number of loops per processor that receive priority.
 
 If there were more, the network threads and the recorder would receive too little time, and
 connections would be lost.
@@ -35,23 +35,23 @@ _MCL_ONFAULT = 4
 def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
     """Requests all real-time settings for this process, such as priority and locked memory.
 
-    They make the control loop start its periods on time. Settings that the operating system
-    does not permit are left out.
+    The settings make the ticks of the control loop start on time. Those that the operating
+    system does not permit are left out.
 
     Args:
-        cpu: Processor to which the process is bound. If None, all processors are permitted.
-        sites: Number of sites of the session on this machine. If there are too many, the
-            scheduling stays normal.
+        cpu: Processor to which the process is pinned. If None, all processors may be used.
+        sites: Number of sites of the session on this machine. If there are too many, normal
+            scheduling is kept.
 
     Returns:
-        For each setting, by its name, a description of what was obtained, or the reason why it
-        was not obtained.
+        A mapping from each setting to a description of what was obtained, or to the reason why
+        it was not obtained.
     """
     cpus = os.cpu_count() or 1
     has_room = sites <= _SITES_PER_PROCESSOR * cpus
 
     def describe_crowded_machine() -> str:
-        """Returns why no real-time scheduling is requested: sites would share a processor.
+        """Explains why real-time scheduling is not requested on a crowded machine.
 
         Example: "normal (3 sites share 2 processors)".
         """
@@ -80,15 +80,15 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
 
 
 def _set_affinity(cpu: int | None) -> str:
-    """Binds the process to one processor, so that the system does not move it to another one.
+    """Pins the process to one processor, so that the system does not move it to another one.
 
-    Moving a process takes time and empties its cache, which makes control periods late.
+    Moving a process takes time and empties its cache, which delays ticks.
 
     Args:
         cpu: Number of the processor. If None, nothing is changed.
 
     Returns:
-        The processors that the process may use, as a text for the log: "cpu 3" or "cpu 0,1".
+        The processors that the process may use, as stored in the log, such as "cpu 0,1".
     """
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
@@ -98,8 +98,8 @@ def _set_affinity(cpu: int | None) -> str:
 def _call_libc(setting: str, function: str, *arguments: int) -> str:
     """Calls a function of the C library that applies a real-time setting to this process.
 
-    An example is `mlockall`, which keeps the memory of the process in RAM. The function must
-    return 0 on success.
+    For example, `mlockall` keeps the memory of the process in RAM. The function must return 0
+    on success.
 
     Args:
         setting: Description of the setting for the user, such as "locked" for memory.
@@ -110,8 +110,8 @@ def _call_libc(setting: str, function: str, *arguments: int) -> str:
         The argument `setting`, because `prepare` reports for each step what was obtained.
 
     Raises:
-        AttributeError: The platform is not Linux. `prepare` reports this error, which a missing
-            function also raises, as "not on this platform".
+        AttributeError: The platform is not Linux. `prepare` reports this error, which is also
+            raised if the function is missing, as "not on this platform".
         OSError: The call has failed.
     """
     if not sys.platform.startswith("linux"):
@@ -125,10 +125,10 @@ def _call_libc(setting: str, function: str, *arguments: int) -> str:
 
 
 def _stop_collector() -> str:
-    """Turns off Python's garbage collection, because its pauses make control periods late.
+    """Turns off Python's garbage collection, because its pauses delay ticks.
 
     Returns:
-        A text for the log that says what was done.
+        A description of what was done, for the log.
     """
     process.disable_gc()
     return "frozen and off"

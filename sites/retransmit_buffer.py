@@ -1,14 +1,14 @@
-"""Stores the recent messages of a site, and sends them again to recorders that missed them.
+"""Stores the recent messages of a site, and resends them to recorders that missed them.
 
-A site is a process that runs one arm, and publishes its state in every period of the control
-loop. A recorder is a process that writes these messages to the log. Messages may be lost on the
-network. The recorder notices gaps in their numbers, and queries the site for the missing ones.
+A site publishes its state in every tick, and recorders write these messages to the log. If
+messages are lost on the network, a recorder notices gaps in their numbers and queries the site
+for the missing ones.
 
 Invariant (law L6 of docs/develop/design.md):
-    - The memory is bounded and allocated at the start. It holds at most a minute of every
+    - Memory is bounded and allocated at the start. It holds at most one minute of every
       channel.
-    - The computing time is bounded. The control loop answers one query at a time, with a
-      limited number of messages, and only if time is left in a tick.
+    - Computing time is bounded. The control loop answers one query at a time, with a limited
+      number of messages, and only if there is time left in a tick.
 """
 
 from array import array
@@ -30,26 +30,26 @@ from trilat_net.records import Layout
 KEPT_S = 60
 """Time for which messages are stored, in s."""
 RECORDS_KEPT = 120_000
-"""Largest number of stored records: a minute at tick rates up to 2 kHz, less at higher rates.
+"""Maximum number of stored records: one minute at tick rates up to 2 kHz, less at higher rates.
 """
 _RECORD_BYTES = 640
-"""Mean size of a record of a two-joint arm for which the memory is planned, in bytes."""
+"""Mean record size of a two-joint arm, used to dimension the memory, in bytes."""
 _FLOAT_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
 _STATISTICS_BYTES = 4_096
 """Memory for one message with statistics, in bytes."""
 EVENTS_KEPT = 4_096
-"""Largest number of stored events."""
+"""Maximum number of stored events."""
 _EVENTS_BYTES = 4_000_000
 """Memory for events, in bytes."""
 
 
 class ChannelBuffer:
-    """Stores the latest messages of one channel, numbered consecutively.
+    """Stores the most recent messages of one channel, numbered consecutively.
 
-    A channel is for example that of a site's records (results of its ticks). The messages are
-    stored one after another in a ring of bytes that is allocated at the start, so that no
-    memory is allocated while the control loop runs. New messages overwrite the oldest ones.
+    The messages are stored one after another in a ring of bytes that is allocated at the start,
+    so no memory is allocated while the control loop is running. New messages overwrite the
+    oldest ones.
 
     Args:
         capacity: Largest number of messages.
@@ -76,20 +76,19 @@ class ChannelBuffer:
     def start_at(self, number: int) -> None:
         """Sets the number of the first message that will be stored.
 
-        The first message of a site that joins a running session does not have the number 0. The
-        method may be called only while the buffer is empty.
+        Needed for a site that joins a running session, whose first message does not have the
+        number 0. May only be called while the buffer is empty.
 
         Args:
-            number: The number of the first message.
+            number: Number of the first message.
         """
         self.next_number = number
         self.oldest = number
 
     def store(self, payload: bytes) -> None:
-        """Stores a published message under the next number, so that it can be sent again.
+        """Stores a published message under the next number, so that it can be resent.
 
-        A recorder that finds a gap in the numbers requests the missing messages. If the buffer
-        is full, the oldest messages are removed.
+        If the buffer is full, the oldest messages are removed.
 
         Args:
             payload: The encoded message.
@@ -117,8 +116,8 @@ class ChannelBuffer:
     def skip(self, count: int) -> None:
         """Stores empty messages for numbers that the site never publishes.
 
-        Message numbers follow the control periods. A skipped period has no message, and without
-        the empty ones all later messages would have wrong numbers.
+        Message numbers follow the ticks, and a skipped tick has no message. Without empty
+        messages in their place, all later messages would get wrong numbers.
 
         Args:
             count: Number of empty messages.
@@ -129,8 +128,7 @@ class ChannelBuffer:
     def read_chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
         """Returns as many consecutive stored messages as fit into one network reply.
 
-        A recorder that has missed messages requests them again. For messages that do not fit,
-        it sends a further request.
+        The recorder sends another request for the messages that do not fit.
 
         Args:
             first: Number of the first requested message. If it is no longer stored, the reply
@@ -157,18 +155,18 @@ class ChannelBuffer:
 
 
 class RetransmitBuffer:
-    """Stores the recently published messages of a site, and answers the queries of recorders.
+    """Stores the recent messages of a site, and answers recorders' queries for lost ones.
 
-    If a message is lost on the network, the recorder notices the gap in the numbers, and asks
+    If a message is lost on the network, the recorder notices the gap in the numbers and asks
     the site to send the message again.
 
     Args:
-        site: The site in the simulation kernel, which computes its arm and its control law.
+        site: The site in the simulation kernel.
         boot: Random number that identifies this start of the site.
         queries: Queue of the queries.
 
     Attributes:
-        channels: Stored messages of the records, statistics and events, by channel.
+        channels: Mapping from channel (records, statistics and events) to its stored messages.
     """
 
     def __init__(self, site: Site, boot: int, queries: QueryInbox) -> None:
@@ -188,11 +186,11 @@ class RetransmitBuffer:
     def start_at(self, tick: int) -> None:
         """Sets the first tick of a site that joins a running session.
 
-        Its records and statistics are then numbered from this tick. The method must be called
-        before any message is stored.
+        Records and statistics are then numbered from this tick. Must be called before any
+        message is stored.
 
         Args:
-            tick: Number of the first tick, a period of the control loop.
+            tick: Number of the first tick.
         """
         link_number = count_messages(topics.LINK, tick, self._site.rate_hz)
         self.channels[topics.STATE].start_at(tick)
@@ -202,12 +200,12 @@ class RetransmitBuffer:
         """Adds an empty message for each message that the skipped ticks would have published.
 
         The number of a message follows from its tick: a record (channel `STATE`) has the number
-        of its tick, and statistics (channel `LINK`), which are published several times a
+        of its tick, and statistics (channel `LINK`), which are published several times per
         second, are numbered from 0. Without the empty messages, later messages would be stored
         under wrong numbers.
 
         Args:
-            first: First skipped tick, a period of the control loop.
+            first: First skipped tick.
             next_tick: First tick after the skipped ones.
         """
         skipped_ticks = next_tick - first
@@ -222,12 +220,12 @@ class RetransmitBuffer:
         self.channels[topics.LINK].skip(unpublished_statistics)
 
     def answer_query(self) -> bool:
-        """Answers the oldest request of a recorder for messages that it has missed.
+        """Answers the oldest request from a recorder for messages that it has missed.
 
-        One call answers one request, so that many requests do not delay the control loop.
+        Each call answers only one request, so that many requests do not delay the control loop.
 
         Returns:
-            True if a query was answered. False if no query was waiting.
+            True if a query was answered, or False if no query was waiting.
         """
         query = self._queries.poll()
         if query is None:
@@ -236,7 +234,7 @@ class RetransmitBuffer:
         return True
 
     def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
-        """Finds the stored messages that a recorder has missed and now requests.
+        """Looks up the stored messages that a recorder has missed and now requests.
 
         Args:
             wanted: The request, with the channel and the numbers of the missing messages.

@@ -1,13 +1,12 @@
 """Runs the control loop of one arm, from the start of the session to its last tick.
 
-`RunningSite` is the object that the loop in `site_loop` calls in every tick (period of the
-loop), and ten times a second for work that is not urgent. Three other objects do the work that
-is not part of a tick: `SiteNews` reports events, `PeerAdmission` admits other arms, and
-`SiteEnd` leaves the session.
+The loop in `site_loop` calls a `RunningSite` in every tick, and ten times per second for work
+that is not urgent. Three other objects do the work that is not part of a tick: `SiteNews`
+reports events, `PeerAdmission` admits other arms, and `SiteEnd` leaves the session.
 
 Invariant:
     - The work that is not urgent has a fixed order: replies to queries, clocks, members, news.
-      An event about the clock of a peer (another arm) thus precedes the admission that depends
+      This ensures that an event about the clock of a peer precedes the admission that depends
       on it.
 """
 
@@ -36,31 +35,31 @@ from .site_news import SiteNews
 from .site_parts import SiteParts
 
 _NO_BOOT = -1
-"""Used in place of the boot (the number of a process start) of a peer that is not present."""
+"""Placeholder for the boot (the number of a process start) of a peer that is not present."""
 
 
 class RunningSite:
-    """Runs a site from the epoch, the common start of the session, to its last tick.
+    """Runs a site from the epoch (the common start of the session) to its last tick.
 
-    The loop calls its methods: `should_stop` and `step` in every tick, `report_tick` after
-    ticks in which something changed, and `run_housekeeping` ten times a second.
+    The loop calls `should_stop` and `step` in every tick, `report_tick` after ticks in which
+    something changed, and `run_housekeeping` ten times per second.
 
-    If at least a quarter of the period is left after a block of records was published, the loop
-    also calls `use_slack`, which answers one query of a recorder for lost messages. If
-    `use_slack` has answered a query and returns True, the loop calls it again after the next
-    tick, because more queries may wait.
+    If at least a quarter of the tick remains after a block of records was published, the loop
+    also calls `use_slack`, which answers one query from a recorder for lost messages. If
+    `use_slack` answered a query and returned True, the loop calls it again after the next tick,
+    because more queries may be waiting.
 
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
-        pinger: Offsets of the other members' clocks, as estimated by pings.
+        pinger: Offsets of the other members' clocks, as estimated from pings.
         epoch: The agreed epoch, and the members of the session.
 
     Attributes:
-        publish_sample: Function that publishes a sample, the state that peers receive.
+        publish_sample: Function that publishes a sample for the peers.
         publish_link: Function that publishes statistics of the loop and its links.
         report_tick: Function that publishes what has changed in a tick.
-        use_slack: Function that the loop calls if time is left.
+        use_slack: Function that the loop calls if there is time left.
     """
 
     def __init__(
@@ -113,14 +112,14 @@ class RunningSite:
         )
 
     def _make_timing(self, pinger: Pinger) -> SiteTiming:
-        """Returns the schedule of the site's ticks, and the timing of its links.
+        """Creates the schedule of the site's ticks, and the timing of its links.
 
-        Sites on one machine have the same clock. They wake up one after another in each period,
-        in the order of the scenario, so that they do not compete for the processors. The names
-        of the sites on this machine are also stored, for the real-time settings.
+        Sites on one machine share its clock. They wake up one after another in each tick, in
+        scenario order, so that they do not compete for the processors. The names of the sites
+        on this machine are also stored, for the real-time settings.
 
         Args:
-            pinger: Offsets of the other members' clocks, as estimated by pings.
+            pinger: Offsets of the other members' clocks, as estimated from pings.
         """
         parts = self._parts
         epoch = self._epoch
@@ -158,8 +157,7 @@ class RunningSite:
     def run(self) -> SiteEnd:
         """Runs the control loop of the site until the last tick, or until the run ends early.
 
-        A tick is one period of the control loop. The run may end early because of a failure, a
-        signal, or a request of another member.
+        The run may end early because of a failure, a signal, or a request from another member.
 
         Returns:
             The object that publishes how the run ended, and leaves the session.
@@ -208,8 +206,8 @@ class RunningSite:
         """Publishes the real-time settings and the clock offsets, and prints them for the user.
 
         A site that joins a running session also publishes the event `join`. From here on,
-        measurements of an external arm are accepted only from its present driver. If the arm is
-        not at the start pose of the scenario, a warning is published.
+        measurements of an external arm are accepted only from its current driver. If the arm is
+        not in the start pose of the scenario, a warning is published.
         """
         parts = self._parts
         user_lines = self._clock_texts
@@ -247,14 +245,14 @@ class RunningSite:
             parts.say(line)
 
     def should_stop(self) -> bool:
-        """Decides at the beginning of each control period whether the run must end.
+        """Decides at the beginning of each tick whether the run must end.
 
-        Before that, it reads the messages of an external arm and of its dead-man switch,
-        because they can end the run.
+        The messages from an external arm and its dead-man switch are read first, because they
+        can end the run.
 
         Returns:
-            True if the site failed, if a member ended the run for all, if the user stopped the
-            session or this process, or if a peer has been away for too long.
+            True if the site failed, if a member ended the run for everyone, if the user stopped
+            the session or this process, or if a peer has been away for too long.
         """
         parts = self._parts
         for device in (parts.arm, parts.switch):
@@ -271,16 +269,13 @@ class RunningSite:
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """Executes one tick: reads the inputs, computes the torque, and moves a simulated arm.
 
-        The control loop calls this once per period, for example a thousand times per second.
-
         Args:
-            tick: Number of the tick, a period of the control loop.
-            arrivals: Samples of the peers (their published states) that have arrived since the
-                previous tick.
+            tick: Number of the tick.
+            arrivals: Samples from the peers that have arrived since the previous tick.
 
         Returns:
-            The record of the tick. None if the user's own law, plant or operator failed, which
-            ends the run.
+            The record of the tick, or None if the user's own law, plant or operator failed,
+            which ends the run.
         """
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
@@ -305,11 +300,11 @@ class RunningSite:
         return self._output
 
     def run_housekeeping(self, output: TickRecord) -> None:
-        """Executes the work that need not be done in every tick.
+        """Does the work that is not needed in every tick.
 
         The site replies to queries, updates the clock offsets, admits peers that join,
         publishes events, and prints a status line for the user. The loop calls this method ten
-        times a second.
+        times per second.
 
         Args:
             output: Record of the newest tick.

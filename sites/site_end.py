@@ -1,13 +1,13 @@
-"""Leaves a session: publishes how a run ended, and waits until the recorders have stored it.
+"""Leaves a session: publishes how the run ended, and waits until recorders have stored it.
 
 The last messages explain why a run ended, for example because an arm left its limits. They
-would be lost if the process of the arm ended while a recorder still misses messages.
+would be lost if the site ended while a recorder is still missing messages.
 
 Invariant:
     - After its last tick, the process continues until every recorder that is present has stored
-      all its messages, or until a time limit.
-    - The exit code of the process is determined by the run. A signal during the wait for the
-      recorders only ends the wait.
+      all its messages, or until a time limit is reached.
+    - The exit code of the process is determined by the run. A signal received while waiting for
+      the recorders only ends the wait.
 """
 
 import signal
@@ -21,26 +21,27 @@ from trilat_net.records import NS_PER_S, Mode, TickRecord
 from .site_parts import SiteParts
 
 LINGER_NS = 10 * NS_PER_S
-"""Longest time that a site waits at its end after the last query of a recorder, in ns.
+"""Maximum time that a site waits at its end after the last query from a recorder, in ns.
 
-A recorder whose process was suspended, or whose connection broke, needs seconds to connect
-again: the lease of Zenoh, 5 s, and one attempt after that.
+A recorder whose process was suspended, or whose connection broke, needs several seconds to
+reconnect: Zenoh's lease of 5 s, plus one attempt after that.
 """
 _ANNOUNCE_AFTER_NS = NS_PER_S
 """Time after which a site tells the user that it is waiting for a recorder, in ns."""
 LEAVE_TIMEOUT_NS = 2 * NS_PER_S
 """Time that a site waits after the last recorder has stored everything and left, in ns."""
 _QUERIED_NS = NS_PER_S
-"""A recorder counts as present for this time after its last query, even without a token."""
+"""Time after its last query for which a recorder counts as present even without a token, in ns.
+"""
 _POLL_NS = 5_000_000
-"""Longest pause between two polls while the site waits for the recorders, in ns."""
+"""Longest pause between polls while the site waits for the recorders, in ns."""
 
 
 def _summarise_loop(ticks: int, parts: SiteParts) -> str:
-    """Returns a sentence about the executed ticks and the dropped messages of an arm's process.
+    """Summarises the executed ticks and the dropped messages of a site in one sentence.
 
-    It tells the user whether the control loop was punctual and whether the network lost
-    messages. A tick is one period of the control loop.
+    It shows the user whether the control loop was punctual and whether the network lost
+    messages.
 
     Args:
         ticks: Number of the last tick plus 1.
@@ -68,14 +69,11 @@ def _summarise_loop(ticks: int, parts: SiteParts) -> str:
 class SiteEnd:
     """Ends a site: publishes the result, waits for the recorders, and informs the user.
 
-    A site is the process that controls one arm. After its last control period it still has
-    messages that the log needs.
-
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
-        link_monitors: Timing monitors of the links, which know whether the peers (the other
-            sites) have received the last samples of this site.
+        link_monitors: Timing monitors of the links, which know whether the peers have received
+            the last samples of this site.
         output: Record of the last tick. None if no tick was executed.
         failure: Error that ended the run. None if there was none.
     """
@@ -100,15 +98,15 @@ class SiteEnd:
     def leave_session(self) -> int:
         """Publishes how the run ended, waits for the recorders, and tells the user the result.
 
-        The process of the arm stays until then, because the recorders may still request
-        messages that were lost on the network.
+        The process must stay until then, because the recorders may still request messages that
+        were lost on the network.
 
         Returns:
             Exit code of the process: 0, or 128 plus the number of the signal that ended the
             run.
 
         Raises:
-            PeerLeft: A peer left before the end and did not return.
+            PeerLeft: A peer left early and did not return.
             RunFailed: The run failed, at this site or at a peer.
         """
         parts = self._parts
@@ -141,8 +139,7 @@ class SiteEnd:
         """Publishes why and when the run of this arm ended.
 
         A failure is published as a separate event, and so are delays of the user's code. The
-        last event, `end`, says how many ticks (control periods) were executed and why the run
-        ended early.
+        last event, `end`, states how many ticks were executed and, if the run ended early, why.
         """
         parts = self._parts
         output = self._output
@@ -170,22 +167,21 @@ class SiteEnd:
 
     @property
     def _departures(self) -> str:
-        """Sentences about the other sites that left the session and did not come back.
+        """Sentences about the sites that left the session and did not come back.
 
-        A site is a process that controls one arm. The text is empty if no site has left.
+        Empty if no site has left.
         """
         return "; ".join(text for _, text in self._parts.monitor.departed.values())
 
     def _find_cause(self) -> tuple[str, str]:
         """Determines why the run ended before the last tick of the scenario.
 
-        The cause becomes part of the last event in the log, so that a reader of the log need
-        not guess.
+        The cause becomes part of the last event in the log.
 
         Returns:
             member: Name of the member that ended the run. Empty if the run was completed, or
                 was ended by a request to all sites.
-            cause: Text that names the cause, to be appended to the sentence "m1 made 500
+            cause: Phrase that names the cause, to be appended to the sentence "m1 made 500
                 ticks". Empty if the run was completed.
         """
         parts = self._parts
@@ -213,8 +209,8 @@ class SiteEnd:
     def _publish_end_event(self, kind: str, text: str, about: str = "") -> None:
         """Publishes why and when the control loop of this arm ended.
 
-        The event contains the number of executed ticks, the periods of the control loop. The
-        recorder compares this number with the received records to find missing ones.
+        The event contains the number of executed ticks. The recorder compares this number with
+        the received records to find missing ones.
 
         Args:
             kind: Kind of the event, for example "end" or "law".
@@ -227,11 +223,11 @@ class SiteEnd:
         """Waits until every recorder has stored the messages of this site and has left.
 
         Recorders query the site for messages that were lost on the way, and the site must
-        reply. Once all is stored, the site stays for the time that the user's options allow,
-        until the recorders have left.
+        reply. Once everything is stored, the site stays until the recorders have left, for at
+        most the time set by the user's options.
 
-        A first signal does not shorten the wait for the recorders: records that are not stored
-        would be lost with this process. A second signal ends it.
+        A first signal does not shorten the wait for the recorders, because records that are not
+        stored would be lost with this process. A second signal ends it.
         """
         parts = self._parts
         clock = parts.clock
@@ -267,7 +263,7 @@ class SiteEnd:
             clock.sleep_until(clock.monotonic_ns() + _POLL_NS)
 
     def _may_leave(self) -> bool:
-        """Returns True if the site need not wait for the recorders any longer.
+        """Returns True if the site no longer has to wait for the recorders.
 
         After a first signal such as Ctrl-C, the site waits until the recorders have stored
         everything. A second signal ends the wait at once.

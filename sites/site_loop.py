@@ -1,22 +1,21 @@
-"""Runs the control loop of an arm in real time, and queues the states that other arms send.
+"""Runs the control loop of an arm in real time, and queues the samples sent by other arms.
 
-The process of an arm is called a site. In every tick (one period of the control loop), the loop
-sleeps until the tick is due, takes the samples that the peers (other sites) have sent
-meanwhile, computes the torque, and publishes the state of its own arm: a sample for the peers,
-and a record of the tick for the recorder.
+In every tick, the loop sleeps until the tick is due, reads the samples that the peers have sent
+in the meantime, computes the torque, and publishes the state of its own arm: a sample for the
+peers, and a record of the tick for the recorder.
 
 Invariant (law L1 of docs/develop/design.md):
-    - Tick k is due k periods after the epoch, the common start time of the session. The periods
-      are those of the leader, the first site of the scenario. Sites on one machine wake up one
-      after another within the period.
-    - A late tick computes the same numbers as a punctual tick, because formulas contain the
-      nominal time of a tick and never the measured one. A late loop executes the missed ticks
-      immediately one after another. With an external arm it skips them, because the arm has
-      moved in the meantime.
+    - Tick k is due k tick periods after the epoch, the common start time of the session, as
+      measured by the leader (the first site of the scenario). The sites on one machine wake up
+      one after another within the tick.
+    - A late tick computes the same values as a punctual tick, because formulas use the nominal
+      time of a tick and never the measured one. A late loop executes the missed ticks
+      immediately one after another. With an external arm it skips them instead, because the arm
+      has moved in the meantime.
     - A message from the network cannot raise an exception in the loop. It is either a valid
-      sample of a peer, or it is dropped and counted by the reason.
-    - The arrival time of a sample is measured when it arrives, and not when a tick reads it, so
-      that measured delays do not depend on the period of the loop.
+      sample from a peer, or it is dropped and counted under the reason.
+    - The arrival time of a sample is measured when it arrives, not when a tick reads it, so
+      measured delays do not depend on the tick rate.
 """
 
 from bisect import bisect_right
@@ -48,7 +47,7 @@ from trilat_net.net import (
 from trilat_net.records import NS_PER_S, Arrival, Mode, TickRecord
 
 _GLIDE_AHEAD_LIMIT_NS = NS_PER_S
-"""Largest time by which a sample may lie in the future under the rule `glide`, in ns.
+"""Maximum time by which a sample may lie in the future under the rule `glide`, in ns.
 
 Under this rule, arms glide back to their peers after an interrupted connection.
 """
@@ -57,16 +56,14 @@ STEP_MARGIN_RAD = 0.02
 
 
 class PeerInbox:
-    """Receives the samples of the peers of a site, and drops those that fail a check.
+    """Receives the samples from the peers of a site, and drops those that fail a check.
 
-    A sample is the state that a peer publishes in each tick, a period of its control loop.
-
-    A boot is a number that identifies one start of a process. For each peer, only samples of
-    one boot are accepted, so that a peer that was started twice does not act twice. A site that
+    For each peer, only samples with a single boot (the number that identifies one start of a
+    process) are accepted, so that a peer that was started twice does not act twice. A site that
     joins a running session ignores samples from before its own first tick.
 
-    If the scenario lets the arm glide back to its peers after a break, two more kinds of
-    samples are dropped: those far in the future, and those that the peer's arm cannot have
+    If the scenario lets the arm glide back to its peers after an interruption, two more kinds
+    of samples are dropped: those far in the future, and those that the peer's arm cannot have
     reached from its previous sample within its speed limit.
 
     Args:
@@ -75,7 +72,8 @@ class PeerInbox:
         rings: Inboxes of the samples, with the time of each arrival.
         boots: Boot of each peer.
         monitors: Timing monitors of the links.
-        dropped: Number of dropped samples by reason. The counts are increased in place.
+        dropped: Mapping from reason to number of dropped samples. The counts are increased in
+            place.
         from_ns: Time of the site's first tick, in ns since the epoch (the common start of the
             session).
     """
@@ -108,16 +106,16 @@ class PeerInbox:
             self.drain(from_ns)
 
     def admit(self, index: int, boot: int, first: int) -> None:
-        """Accepts samples of a restarted peer, and no more samples of its previous process.
+        """Accepts samples from a restarted peer, and no longer from its previous process.
 
-        A sample is accepted only if it has the boot that is stored for its peer. The ticks
-        between the last sample of the previous process and the first tick of the new process
-        have no samples, and do not count as missing.
+        A sample is accepted only if it has the boot stored for its peer. The ticks between the
+        last sample of the previous process and the first tick of the new process have no
+        samples, and do not count as missing.
 
         Args:
             index: Index of the peer among all peers of this site.
             boot: Number that identifies the new process of the peer.
-            first: First tick (period of the control loop) of the new process.
+            first: First tick of the new process.
         """
         self._boots[index] = boot
         # The new process may start in any pose. Therefore its first sample is not compared with
@@ -130,16 +128,16 @@ class PeerInbox:
     def find_last_tick_of(self, index: int, boot: int) -> int | None:
         """Returns the last tick whose sample has arrived from a peer before its restart.
 
-        A tick is one period of the peer's control loop. A boot is the number that identifies a
-        process. This method is called before `admit`, which stores the boot of the new process.
+        Call this method before `admit`, which replaces the stored boot with that of the new
+        process.
 
         Args:
             index: Index of the peer among all peers of this site.
-            boot: Boot of the new process of the peer, whose samples are not accepted yet.
+            boot: Boot of the peer's new process, whose samples are not accepted yet.
 
         Returns:
-            The last tick received from the previous process. None if no sample of that process
-            has arrived, or if the samples of `boot` are accepted already.
+            The last tick received from the previous process. None if no sample from that
+            process has arrived, or if the samples with `boot` are already accepted.
         """
         accepted_boot = self._boots[index]
         is_accepted_already = boot == accepted_boot
@@ -152,17 +150,16 @@ class PeerInbox:
         return last_tick
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
-        """Returns the states of the other arms that have arrived and pass all checks.
+        """Returns the samples that have arrived from other arms and pass all checks.
 
-        The control loop calls this at the beginning of each tick (period). A state that another
-        arm has published is called a sample.
+        The control loop calls this method at the beginning of each tick.
 
         Args:
             since_epoch_ns: Present time, in ns since the epoch (the common start of the
                 session).
 
         Returns:
-            At most `MAX_ARRIVALS` samples, peer by peer, in the order of their arrival. Further
+            At most `MAX_ARRIVALS` samples, grouped by peer and in order of arrival. Further
             samples stay in the queue.
         """
         arrivals: list[Arrival] = []
@@ -181,20 +178,21 @@ class PeerInbox:
         arrived_ns: int,
         since_epoch_ns: int,
     ) -> Arrival | None:
-        """Checks the state that another arm has sent, and measures its delay.
+        """Checks a sample from another arm, and measures its delay.
 
-        A message is dropped and counted if it cannot be decoded, comes from an unexpected
-        process, or lies too far in the future, so that a faulty sender cannot move this arm.
+        A sample is dropped and counted if it cannot be decoded, comes from an unexpected
+        process, or lies too far in the future. This prevents a faulty sender from moving this
+        arm.
 
         Args:
             index: Index of the peer.
-            sample: The sample, or the error with which its decoding failed.
+            sample: The sample, or the error raised when decoding it.
             arrived_ns: Time of its arrival on the local clock, in ns.
             since_epoch_ns: Present time, in ns since the epoch (the common start of the
                 session).
 
         Returns:
-            The sample as an input of the tick. None if the sample is dropped.
+            The sample as an input of the tick, or None if it is dropped.
         """
         if isinstance(sample, WireError):
             self._dropped[sample.reason] += 1
@@ -248,7 +246,7 @@ class PeerInbox:
 
         Args:
             index: Index of the peer.
-            sample: Sample of the peer. If it is plausible and the newest, it is stored.
+            sample: Sample from the peer. If it is plausible and the newest, it is stored.
         """
         link = self._links[index]
         newest = self._newest[index]
@@ -273,31 +271,30 @@ class PeerInbox:
 
 
 _BLOCKS_PER_S = 100
-"""Number of blocks per second: recorders receive the records of 10 ms in one block."""
+"""Number of blocks per second. Recorders receive the records of 10 ms in one block."""
 _WAKES_PER_S = 200
-"""Peers on one machine receive the samples of 5 ms together, unless they need them sooner."""
+"""Number of wake ticks per second, at which local peers receive the samples of 5 ms together.
+"""
 
 
 class StateBlock:
     """Collects the records of a site's ticks, and sends them to the recorders in blocks.
 
-    A record is the stored result of one tick, and a sample is the part of a record that the
-    peers need. Blocks of records cost less computing time than single messages. A record is
-    always sent after the sample of its tick, because it contains the time at which the sample
-    was sent.
+    Blocks of records take less computing time than single messages. A record is always sent
+    after the sample of its tick, because it contains the time at which the sample was sent.
 
     Args:
         site: The site in the simulation kernel.
         boot: Random number that identifies this start of the site.
         send: Function that publishes the encoded records of a block.
         turn: Index of the site in the scenario. Sites on one machine send their blocks in
-            different ticks, so that the work is spread over time.
+            different ticks, which spreads the work over time.
         single: True if each record is sent in its own tick, as the program of an external arm
             requires.
 
     Attributes:
-        holds_samples: True if the samples for the peers are collected as well, so that peers on
-            the same machine are woken up less often.
+        holds_samples: True if the samples for the peers are collected too, so that peers on the
+            same machine are woken up less often.
     """
 
     def __init__(
@@ -329,14 +326,15 @@ class StateBlock:
         late_us: int,
         busy_us: int,
     ) -> bool:
-        """Adds the record of a tick to the present block, and decides if the block is due.
+        """Adds the record of a tick to the current block, and decides whether the block is due.
 
-        A block is due once it is complete, or while an operator moves the arm. The operator's
-        program computes the rendered force from the records, and needs each of them at once.
+        A block is due once it is complete, or while an operator is moving the arm. The
+        operator's program renders the force from the records, and needs each of them
+        immediately.
 
         Args:
-            output: The record, the result of the tick.
-            arrivals: Samples of the peers (their published states) that the tick has received.
+            output: The record.
+            arrivals: Samples from the peers received by the tick.
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
 
@@ -350,17 +348,17 @@ class StateBlock:
         return has_operator or is_block_complete
 
     def send_samples(self, tick: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends the waiting samples to the peers, unless they are held until a later tick.
+        """Sends the pending samples to the peers, unless they are held until a later tick.
 
         If the samples may be held (`holds_samples`), they are sent together in every wake tick.
-        Wake ticks occur `_WAKES_PER_S` times a second, in different ticks for sites of
+        Wake ticks occur `_WAKES_PER_S` times per second, in different ticks for sites with
         different `turn`, so that not all sites of a machine wake their peers at the same time.
 
         Args:
-            tick: Number of the present tick (period of the control loop).
+            tick: Number of the current tick.
             send: Function that sends the sample of a record. It returns the sending time and
-                the confirmations of received samples ("echoes") that the sample contained. Both
-                become part of the record.
+                the acknowledgements of received samples ("echoes") contained in the sample.
+                Both become part of the record.
         """
         ticks_after_this_one = tick + 1
         is_wake_tick = (ticks_after_this_one - self._turn) % self._ticks_per_wake == 0
@@ -368,10 +366,10 @@ class StateBlock:
             self._send_waiting_samples(send)
 
     def _send_waiting_samples(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends the waiting states of this arm (samples) to the other arms.
+        """Sends the pending samples of this arm to the other arms.
 
-        This completes the records of the same control periods, because a record states when its
-        sample was sent. The records move to the next block for the recorders.
+        This completes the records of the same ticks, because a record states when its sample
+        was sent. The records move to the next block for the recorders.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.
@@ -382,10 +380,9 @@ class StateBlock:
         self._waiting_records.clear()
 
     def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends the waiting results of control periods over the network.
+        """Sends the pending samples to the peers, and the pending records to the recorders.
 
-        The other arms receive their samples (the parts that their control laws need) first,
-        because they are waiting for them. The recorders then receive the complete records.
+        The samples are sent first, because the peers are waiting for them.
 
         Args:
             send: Function that sends the sample of a record, see `send_samples`.
@@ -403,48 +400,46 @@ class StateBlock:
 
 
 class _LoopSite(Protocol):
-    """The methods that the control loop calls in each period and between periods.
+    """Methods that the control loop calls in each tick and between ticks.
 
-    `RunningSite` has them in a session, and `loop_rehearsal` replaces them for measuring the
-    machine. The loop ignores the results of the type `object`.
+    They are implemented by `RunningSite` in a session, and by `loop_rehearsal` for measuring
+    the machine. The loop ignores results of type `object`.
     """
 
     def should_stop(self) -> bool:
-        """Returns True if the present tick must not be executed, because the run is over."""
+        """Returns True if the current tick must not be executed, because the run is over."""
 
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """Executes one period of the control loop: reference, control law and motion of an arm.
+        """Executes one tick: computes the reference, the control law and the motion of the arm.
 
         Args:
             tick: Number of the tick.
-            arrivals: Samples (states of the other arms) that have arrived since the previous
-                tick.
+            arrivals: Samples that have arrived since the previous tick.
 
         Returns:
-            The record of the tick. None if the run ends because the tick failed.
+            The record of the tick, or None if the run ends because the tick failed.
         """
 
     def publish_sample(self, payload: bytes, /) -> object:
-        """Publishes an encoded sample, the part of a record that the peers need."""
+        """Publishes an encoded sample (the part of a record that the peers need)."""
 
     def publish_link(self, payload: bytes, /) -> object:
         """Publishes encoded statistics of the loop and its links, which the recorder stores."""
 
     def run_housekeeping(self, output: TickRecord, /) -> object:
-        """Executes the slow tasks of the control process, ten times a second.
+        """Does the slow work of the site, ten times per second.
 
-        They are replies to queries, clock comparison, the list of present processes, and news
-        for the user. They are not part of the control period, because they would make it too
-        long.
+        This includes replies to queries, clock comparison, the list of present processes, and
+        news for the user. It is not part of a tick, because it would take too long.
 
         Args:
             output: Record of the newest tick.
         """
 
     def report_tick(self, output: TickRecord, /) -> object:
-        """Publishes events and alarms about what has changed in a control period.
+        """Publishes events and alarms about what has changed in a tick.
 
-        An example is an arm that stopped following the others, because their messages were
+        For example, an arm may have stopped following the others because their samples were
         missing.
 
         Args:
@@ -452,12 +447,12 @@ class _LoopSite(Protocol):
         """
 
     def use_slack(self) -> bool:
-        """Does one piece of work that can wait, in the time left before the next period.
+        """Does one piece of work that can wait, in the time left before the next tick.
 
-        An example is to answer a recorder's request for lost messages.
+        For example, it may answer a recorder's request for lost messages.
 
         Returns:
-            True if more work may wait.
+            True if there may be more work.
         """
 
 
@@ -469,9 +464,9 @@ def _publish_sample(
     io: _LoopSite,
     output: TickRecord,
 ) -> tuple[Any, ...]:
-    """Sends the state of this arm to the other arms after a control period (tick).
+    """Sends the state of this arm to the other arms after a tick.
 
-    This message, the sample, has only the part of the result that their control laws need.
+    This message (the sample) contains only the part of the result that their control laws need.
 
     Args:
         name: Name of this site.
@@ -483,8 +478,8 @@ def _publish_sample(
 
     Returns:
         The time of sending in ns since the epoch (the common start of the session), on the
-        local clock; and the echoes, which confirm the samples of the peers that have arrived,
-        with the times of arrival. The peers compute delays and round trip times from them.
+        local clock, and the echoes, which acknowledge samples received from the peers along
+        with their times of arrival. From them, the peers compute delays and round trip times.
     """
     sent_ns = timing.record_sent(output.tick, clock.monotonic_ns())
     echo = timing.pop_echo()
@@ -508,21 +503,18 @@ def run_loop(
 ) -> TickRecord | None:
     """Executes the ticks of a site in real time, until the end of the run or an error.
 
-    Each round waits until a tick is due, receives the samples of the peers (their published
-    states), computes the tick, and publishes the results. Work that is not urgent follows in
-    the rest of the period.
-
-    A tick is one period of the control loop.
+    Each iteration waits until a tick is due, receives the samples from the peers, computes the
+    tick, and publishes the results. The rest of the tick is used for work that is not urgent.
 
     Args:
         site: The site in the simulation kernel.
         boot: Random number that identifies this start of the site.
         ticks: Number of the tick before which the run ends.
         clock: Clock of this process.
-        inbox: Samples of the peers.
+        inbox: Samples from the peers.
         timing: Times at which ticks are due, and clocks of the peers.
         stats: Statistics of the loop, which are updated in every tick.
-        states: Records (results of ticks) that wait to be sent to the recorders.
+        states: Records that are waiting to be sent to the recorders.
         io: The running site, which computes each tick, and handles messages and events.
         first: Number of the first tick.
         catches_up: True if missed ticks are executed one after another, False if they are

@@ -1,11 +1,11 @@
 """Reports what happens at an arm: events for the log and other processes, lines for the user.
 
-While the control loop of the arm runs, a `SiteNews` publishes an event for each change that
-took effect, such as a new delay or a new mode, and prints alarms and a status line.
+While the control loop of the arm is running, a `SiteNews` publishes an event for each change
+that took effect, such as a new delay or a new mode, and prints alarms and a status line.
 
 Invariant:
     - Every event is published after the record of the tick to which it belongs.
-    - An event or alarm that would repeat in every tick is issued at most once a second.
+    - An event or alarm that would repeat in every tick is issued at most once per second.
 """
 
 from collections.abc import Sequence
@@ -30,17 +30,17 @@ from trilat_net.scenario import Change
 from .site_parts import SiteParts
 
 _STATUS_PERIOD_S = 5
-"""Time between two status lines for the user, in s."""
+"""Interval between status lines for the user, in s."""
 
 
 class SiteNews:
     """Publishes the events of a running site, and prints lines for its user.
 
-    Events tell the recorder and the other processes what happened at this arm, for example that
-    it stopped because the network was interrupted.
+    Events inform the recorder and the other processes of what happened at this arm, for example
+    that it stopped because the network was interrupted.
 
     The control loop calls `report_tick` after ticks in which something changed, and
-    `publish_news` ten times a second.
+    `publish_news` ten times per second.
 
     Args:
         parts: Parts of the site.
@@ -63,11 +63,10 @@ class SiteNews:
         """Publishes an event for each change that took effect in a tick, such as a new delay.
 
         A new mode of the site, such as "fault", is also a change. Skipped ticks are only stored
-        here, because `publish_news` later publishes them together in one event. A tick is a
-        period of the control loop.
+        here; `publish_news` later publishes them together in one event.
 
         Args:
-            output: Record of the tick: what the site measured and computed.
+            output: Record of the tick.
         """
         parts = self._parts
         skipped = count_skipped_ticks(output.cmd)
@@ -96,10 +95,10 @@ class SiteNews:
             self._raise_alarm(output)
 
     def _raise_alarm(self, output: TickRecord) -> None:
-        """Prints an alarm with a reason and a remedy, if the new mode requires an alarm.
+        """Prints an alarm with a reason and a remedy if the new mode requires one.
 
         Alarms exist only under the rule `glide` for interrupted connections. An arm that holds
-        its position may change its mode many times, and raises at most one alarm a second.
+        its position may change its mode many times, and raises at most one alarm per second.
 
         Args:
             output: Record of the tick in which the mode has changed.
@@ -137,7 +136,7 @@ class SiteNews:
     def publish_news(self, output: TickRecord) -> None:
         """Publishes events about what has happened since the last call, such as alarms.
 
-        The control loop calls this method ten times a second, between two periods. The status
+        The control loop calls this method ten times per second, between two ticks. The status
         line for the user is also printed when it is due.
 
         Args:
@@ -174,7 +173,7 @@ class SiteNews:
         news.clear()
 
     def publish_skipped(self, output: TickRecord) -> None:
-        """Publishes one event about all control periods (ticks) skipped since the last call.
+        """Publishes one event about all ticks skipped since the last call.
 
         Ticks are skipped only if the arm is external and the loop was late, because a real
         robot cannot catch up.
@@ -191,9 +190,9 @@ class SiteNews:
             )
 
     def _publish_waiting(self, output: TickRecord) -> None:
-        """Reports once a second that the arm is too far from its peers to approach them.
+        """Reports once per second that the arm is too far from its peers to approach them.
 
-        This can only happen if the scenario lets an arm glide back to its peers after an
+        This can happen only if the scenario lets an arm glide back to its peers after an
         interrupted connection. The arm then waits until its operator moves it closer.
 
         Args:
@@ -215,8 +214,8 @@ class SiteNews:
     def _describe_status(self, output: TickRecord) -> str:
         """Returns the status line that is printed for the user every few seconds.
 
-        It contains the time, the mode, the largest synchronisation error and torque of a joint,
-        and the numbers of late ticks and dropped messages.
+        It contains the time, the mode, the largest synchronisation error and torque of any
+        joint, and the numbers of late ticks and dropped messages.
         """
         parts = self._parts
         position = np.array([output.shared()[0]])

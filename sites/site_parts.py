@@ -1,14 +1,13 @@
-"""Creates everything that the process of an arm needs before it joins a session.
+"""Creates everything that a site needs before it joins a session.
 
-The process is called a site. `SiteParts` creates the arm and its control law in the simulation
-kernel, the queues for incoming messages, the publishers, the buffer from which lost messages
-are sent again, and whatever else the scenario requires. `site_process` then joins the session
-with these parts.
+`SiteParts` creates the arm and its control law in the simulation kernel, the queues for
+incoming messages, the publishers, the buffer from which lost messages are resent, and whatever
+else the scenario requires. `site_process` then joins the session with these parts.
 
 Invariant:
-    - When a `SiteParts` object has been created, all subscriptions of the site are declared and
-      its control step is compiled. A site announces itself only after that, so that it misses
-      no message and its first tick is not late.
+    - Once a `SiteParts` object has been created, all subscriptions of the site are declared and
+      its control step is compiled. A site announces itself only after that, so it misses no
+      message and its first tick is not late.
 """
 
 from collections.abc import Callable
@@ -61,22 +60,20 @@ from .site_loop import StateBlock
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """The user's options for how an arm's process joins a session and waits for others.
+    """The user's options for how a site joins a session and waits for others.
 
-    Such a process is called a site. The options come from the command line of `trilat site`.
+    The options are given on the command line of `trilat site`.
 
     Attributes:
         session: Name of the session.
         connection: Endpoints of the site, and keys.
         join_timeout_s: Longest wait for the start of the session, in s.
         needs_recorder: True if the session starts only when a recorder is present.
-        cpu: Processor to which the control loop is bound. If None, all processors are
-            permitted.
+        cpu: Processor to which the control loop is pinned. If None, all processors may be used.
         stay_s: Longest time for which the site stays after the run until the recorder has left,
             in s.
-        clock_offset_s: Offset that is added to the clock of the site, to emulate another
-            machine, in s.
-        clock_drift_ppm: Drift that is added to the clock of the site, in parts per million.
+        clock_offset_s: Offset added to the clock of the site to emulate another machine, in s.
+        clock_drift_ppm: Drift added to the clock of the site, in parts per million.
         without: Sites that the session does not wait for. They may join the running session.
         leave_timeout_s: How long the site continues after a peer has left and not returned, in
             s. If None, it continues until the end of the run.
@@ -95,10 +92,9 @@ class SiteOptions:
 
 
 class SiteParts:
-    """All objects of which a site consists: arm, control law, network queues and buffers.
+    """All objects that make up a site: arm, control law, network queues and buffers.
 
-    A site is a process that runs one arm and its control loop. The constructor creates the
-    objects that the scenario needs. All others are None.
+    The constructor creates the objects that the scenario needs. All others are None.
 
     Args:
         scenario: Scenario of the session.
@@ -116,11 +112,9 @@ class SiteParts:
         hand: The live operator, a person or program that moves the arm.
         step: Function that computes one tick. If the control law is the user's own, the
             watchdog measures its computing time.
-        rings: Queues of the samples, the states that the peers publish, in the order of the
-            links.
+        rings: Queues of the samples from the peers, in the order of the links.
         buffer: Recent messages, for recorders that missed them.
-        states: Records (results of ticks of the control loop) that wait to be sent to the
-            recorders.
+        states: Records that are waiting to be sent to the recorders.
         monitor: Presence of the other members of the session.
         changes: Requests to change something during the run.
     """
@@ -192,9 +186,9 @@ class SiteParts:
         warm_up(scenario, name, clock)
 
     def _key(self, channel: str, member: str = "") -> str:
-        """Returns the network address ("key" in Zenoh) on which a process publishes a channel.
+        """Returns the Zenoh key under which a process publishes a channel.
 
-        A key contains the names of the session, of the process, and of the channel.
+        A key contains the names of the session, the process, and the channel.
 
         Args:
             channel: Name of the channel, such as its records or events, see `topics`.
@@ -205,9 +199,8 @@ class SiteParts:
     def _make_publishers(self) -> None:
         """Creates the functions that publish samples, records and statistics.
 
-        A sample goes to the peers, a record (the stored result of a tick) and statistics go to
-        the recorder. Records and statistics are also stored in the buffer, so that a recorder
-        that has lost some of them can request them again.
+        Samples go to the peers; records and statistics go to the recorder. The latter are also
+        stored in the buffer, from which a recorder can request those that it has lost.
         """
         scenario = self.scenario
         self.publish_sample = self.bus.publisher(self._key(topics.SAMPLE))
@@ -230,12 +223,12 @@ class SiteParts:
         self.states.holds_samples = peers_can_wait and not sends_every_tick
 
     def _watch_code(self, name: str, rate_hz: int) -> Callable[..., Any]:
-        """Returns a function that calls a user's code and measures its computing time.
+        """Returns a function that calls a user's code and limits its computing time.
 
-        Slow code would delay the control loop. Therefore a watchdog limits its time.
+        Without this limit, slow code would delay the control loop.
 
         Args:
-            name: Name of the code, as in "the plant myplant:MyPlant".
+            name: Name of the code, such as "the plant myplant:MyPlant".
             rate_hz: How often the code is called, in 1/s.
 
         Returns:
@@ -249,7 +242,7 @@ class SiteParts:
     def _connect_hand(self) -> None:
         """Creates the object through which people or programs move the arm, if there are any.
 
-        A user's operator class runs in this process (`HandPlayer`) or in a process of its own
+        A user's operator class runs in this process (`HandPlayer`) or in its own process
         (`RemoteHand`). Without such a class, people and programs may move the arm over the
         network (`HandServer`).
         """
@@ -315,8 +308,7 @@ class SiteParts:
     def _make_storing_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
         """Returns a function that publishes messages and also stores them for a while.
 
-        A recorder that missed a message on the network requests it again, and receives the
-        stored copy.
+        A recorder that has missed a message requests it again, and receives the stored copy.
 
         Args:
             channel: Channel of the messages, records or statistics.
@@ -325,7 +317,7 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores messages for requests to send them again, and publishes them in blocks.
+            """Stores messages so that they can be resent, and publishes them in blocks.
 
             Args:
                 payloads: The encoded messages.
@@ -340,9 +332,9 @@ class SiteParts:
     def pop_changes(self, tick: int) -> list[CoreChange]:
         """Returns the changes of settings or mode that the site applies in the next tick.
 
-        Some changes were requested by users. Others come from an external arm, a robot or
-        simulator outside of this program: ticks (periods of the control loop) were skipped, the
-        arm has become silent, or its dead-man switch was released or is held again.
+        Some changes were requested by users. Others are caused by an external arm: ticks were
+        skipped, the arm has become silent, or its dead-man switch was released or is held
+        again.
 
         Args:
             tick: Number of the tick.
@@ -368,16 +360,16 @@ class SiteParts:
         return changes
 
     def _make_order_change(self, tick: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
-        """Returns the change by which an order of the site itself takes effect in a tick.
+        """Returns the change that makes a command from the site itself take effect in a tick.
 
-        Such orders follow from an external arm, for example "released" if its dead-man switch
-        was released. As a change, the order is part of the record, so that the run can be
-        repeated.
+        Such commands are caused by an external arm, for example "released" if its dead-man
+        switch was released. As a change, the command is part of the record, so that the run can
+        be repeated.
 
         Args:
-            tick: Number of the tick, a period of the control loop.
-            order: The order.
-            skipped: Number of skipped ticks, for the order "overrun".
+            tick: Number of the tick.
+            order: The command.
+            skipped: Number of skipped ticks, for the command "overrun".
         """
         change = self.scenario.make_site_order(
             site=self.name, order=order, from_ns=tick_ns(tick, self.site.rate_hz), ticks=skipped
@@ -386,23 +378,22 @@ class SiteParts:
 
 
 _MIN_HELD_DELAY_US = 100_000
-"""Smallest delay of a link whose samples may be sent late without an effect, in us."""
+"""Minimum delay of a link whose samples may be sent late without an effect, in us."""
 
 
 def _may_hold_samples(scenario: Scenario, name: str) -> bool:
     """Returns True if a site may send the samples of several ticks together, and thus late.
 
-    A sample is the state that a site sends to its peers in each tick, a period of its control
-    loop. The receiver of a link delays each sample as the scenario prescribes, counted from the
+    The receiver of a link delays each sample as prescribed by the scenario, counted from the
     tick of the sample and not from its arrival. If every link from the site prescribes at least
-    `_MIN_HELD_DELAY_US`, no peer uses a sample before that time. Sending it a few milliseconds
-    late then has no effect on the run.
+    `_MIN_HELD_DELAY_US`, no peer uses a sample before that time, so sending it a few
+    milliseconds late has no effect on the run.
 
-    The result holds for the delays of the scenario. If the user shortens a delay during the
+    The result applies to the delays in the scenario. If the user shortens a delay during the
     run, the site stops holding samples, see `PeerAdmission.watch_members`.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario.
         name: Name of the site.
     """
     for receiver in scenario.names:
@@ -423,16 +414,16 @@ def _may_hold_samples(scenario: Scenario, name: str) -> bool:
 
 
 WARM_UP_TICKS = 200
-"""Number of ticks in which all code of a tick is used at least once."""
+"""Number of ticks after which all code of a tick has been used at least once."""
 
 
 def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     """Executes the control loop of a temporary site, so that all code is compiled.
 
-    The first ticks (periods of the control loop) of the actual site would otherwise be late.
+    Otherwise, the first ticks of the actual site would be late.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario.
         name: Name of the site.
         clock: Clock of this process. If None, a clock is created.
 
@@ -455,18 +446,18 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
 def _watch_law(
     scenario: Scenario, site: Site, clock: Clock
 ) -> tuple[CodeWatchdog, Callable[[TickInput], TickRecord]]:
-    """Creates the function that computes a tick, and a watchdog of a user's control law.
+    """Creates the function that computes a tick, and a watchdog for a user's control law.
 
     A control law that the user has written in Python may be too slow or never return. The
     watchdog limits its computing time. The built-in laws need no watchdog.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario.
         site: The site in the simulation kernel.
         clock: Clock of this process.
 
     Returns:
-        watchdog: The watchdog. It checks only the user's law, and nothing if the law is
+        watchdog: The watchdog. It monitors only the user's law, and nothing if the law is
         built-in. step: Function that computes one tick of the site. It raises LawFailed if the
         user's law fails or is too slow.
     """
@@ -489,7 +480,8 @@ def _watch_law(
 def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
     """Executes ticks of a temporary site, and encodes and decodes the messages of each tick.
 
-    Every tick but the first receives a sample of every peer. Therefore all code of a tick runs.
+    Every tick except the first receives one sample from each peer, so that all code of a tick
+    is executed.
 
     Args:
         setup: Settings of the site.

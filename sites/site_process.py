@@ -1,14 +1,13 @@
 """Runs the process of one arm in a session: joins, controls the arm, and leaves.
 
-The process is called a site. `run_site` connects to the network, builds the parts of the site,
-agrees with the other members on the epoch (the time of tick 0), runs the control loop, and
-waits until the recorders have stored everything. The loop is in `running_site`, the end in
-`site_end`.
+`run_site` connects to the network, builds the parts of the site, agrees with the other members
+on the epoch (the time of tick 0), runs the control loop, and waits until the recorders have
+stored everything. The loop is in `running_site`, the end in `site_end`.
 
 Invariant:
     - A site announces itself only after it has declared its subscriptions and compiled its
-      control step. A site that is announced can thus be expected to execute its first tick in
-      time, and to receive all messages.
+      control step. A site that has been announced is therefore ready to execute its first tick
+      on time and to receive all messages.
     - The arm is braked until the epoch.
 """
 
@@ -38,7 +37,7 @@ from .running_site import RunningSite
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
-"""Longest pause between two polls while the site joins a session, in ns."""
+"""Longest pause between polls while the site joins a session, in ns."""
 
 
 def run_site(
@@ -49,9 +48,8 @@ def run_site(
 ) -> int:
     """Runs the control loop of one arm as a member of a session, from its start to its end.
 
-    Such a process is called a site. It waits for the other sites of the scenario, exchanges the
-    state of its arm with them over the network in every control period, and publishes its
-    results for the recorder.
+    The site waits for the other sites of the scenario, exchanges the state of its arm with them
+    over the network in every tick, and publishes its results for the recorder.
 
     Args:
         scenario: Scenario of the session.
@@ -65,8 +63,8 @@ def run_site(
     Raises:
         SessionError: The session could not begin.
         UsageError: An endpoint cannot be used.
-        ScenarioError: The user's control law cannot be imported or differs from the law that
-            the scenario names, or the scenario lacks the limits of an external arm.
+        ScenarioError: The user's control law cannot be imported or differs from the law named
+            in the scenario, or the scenario lacks the limits of an external arm.
         RunFailed: The run diverged, the user's law failed, or the arm fell silent.
     """
     check_outside_arms(scenario)
@@ -110,8 +108,8 @@ class _LinePrinter:
     """Prints lines in a separate thread, so that a control loop never waits for the terminal.
 
     A terminal may block a program that prints, for example while its user has paused the
-    output. The printer is used as a context manager. Up to 256 lines wait to be printed, and
-    further lines are lost.
+    output. Use the printer as a context manager. Up to 256 lines wait to be printed, and
+    further lines are dropped.
 
     Args:
         print_line: Function that prints a line.
@@ -132,10 +130,10 @@ class _LinePrinter:
         self._thread.join(1.0)
 
     def put(self, text: str) -> None:
-        """Queues a line that another thread prints, without waiting for the terminal.
+        """Queues a line to be printed by another thread, without waiting for the terminal.
 
-        A control loop must not wait for a slow terminal. The line is lost if too many lines
-        wait already.
+        A control loop must not wait for a slow terminal. The line is dropped if too many lines
+        are already waiting.
 
         Args:
             text: The line.
@@ -146,7 +144,7 @@ class _LinePrinter:
     def _print_lines(self) -> None:
         """Prints the queued lines in the printer's thread, until the queue returns None.
 
-        Errors of the output, for example a closed pipe, do not end the session.
+        Output errors, for example a closed pipe, do not end the session.
         """
         while (text := self._lines.get()) is not None:
             with suppress(OSError):
@@ -163,7 +161,7 @@ def join_and_run(parts: SiteParts) -> int:
         parts: Parts of the site, such as its network connection and its arm.
 
     Returns:
-        Exit code of the process, as `run_site` returns it.
+        Exit code of the process, as returned by `run_site`.
 
     Raises:
         SessionError: The session could not begin.
@@ -186,16 +184,17 @@ def join_and_run(parts: SiteParts) -> int:
 
 
 def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
-    """Announces this process to the session, and waits for the others and for a common start.
+    """Announces this process to the session, and waits for the others and the common start.
 
-    All processes agree on the epoch, the start time of the session.
+    All processes agree on the epoch (the start time of the session).
 
     Args:
         parts: Parts of the site, such as its network connection and its arm.
-        give_up_ns: Time at which the site gives up, on the monotonic clock of this process.
+        give_up_ns: Time at which the site gives up, on the monotonic clock of this process, in
+            ns.
 
     Returns:
-        The site, ready to run. None if a signal ended the wait.
+        The site, ready to run, or None if a signal ended the wait.
 
     Raises:
         SessionError: The session did not begin in time, or this site cannot be part of it.
@@ -251,9 +250,9 @@ def _join_session(parts: SiteParts, give_up_ns: int) -> RunningSite | None:
 def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionError:
     """Returns the error for a site that has waited in vain for its session to begin.
 
-    The text names why a running session has not admitted the site, if that is known, and
-    otherwise the members that are missing. Replies of members that could not be decoded are
-    added, as they often explain why a member seems to be missing.
+    The message states why a running session has not admitted the site, if that is known, and
+    otherwise which members are missing. Replies that could not be decoded are mentioned too,
+    since they often explain why a member seems to be missing.
 
     Args:
         parts: Parts of the site.

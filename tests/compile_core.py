@@ -17,7 +17,7 @@ from pathlib import Path
 import trilat_net
 from sites.site_parts import warm_up
 from tests.scenario.builders import planar_task_text, six_joint_text
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.errors import count_nouns
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
@@ -41,7 +41,7 @@ def compile_part(part: str) -> str:
     scenario = read_part(part)
     with tempfile.TemporaryDirectory() as folder:
         file = trilat_net.simulate(scenario).save(Path(folder) / "run.mcap")
-        certify_log(trilat_net.open_log(file))
+        Certificate.of_log(trilat_net.open_log(file))
         trilat_net.verify(file)
         if part in SHIPPED:
             for site in scenario.names:

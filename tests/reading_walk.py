@@ -57,7 +57,7 @@ CERTIFICATE = house.ROOT / "trilat_net/analysis/certificate"
 SCENARIO = house.ROOT / "trilat_net/scenario"
 TABLE_MODULES = [
     SCENARIO / f"{name}.py"
-    for name in ("resolve", "written_tables", "site_tables", "control_tables", "link_tables")
+    for name in ("resolve", "written_tables", "site_tables", "link_tables")
 ]
 """Modules that the tables of a scenario file pass on their way to a complete scenario."""
 
@@ -392,8 +392,8 @@ def walk(*starts: Place) -> Walk:
 def walk_to_judgement() -> Walk:
     """Returns the walk from a log to the exit code of `trilat certify`."""
     return walk(
-        Place(CERTIFICATE / "stability_certificate.py", "certify_log"),
-        Place(CERTIFICATE / "certificate_result.py", "Certificate.accepts"),
+        Place(CERTIFICATE / "stability_certificate.py", "Certificate.of_log"),
+        Place(CERTIFICATE / "stability_certificate.py", "Certificate.accepts"),
     )
 
 

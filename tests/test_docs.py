@@ -35,8 +35,7 @@ from trilat_net.analysis import (
     site_signals,
     stability_decision,
 )
-from trilat_net.analysis.certificate import observed_energy, premises
-from trilat_net.analysis.certificate import stability_certificate as certificates
+from trilat_net.analysis.certificate import functional_judgements, observed_energy, premises
 from trilat_net.analysis.metrics import measured_impedance, motion_metrics, static_windows
 from trilat_net.analysis.theory import (
     characteristic_roots,
@@ -225,13 +224,13 @@ STATED: list[tuple[str, str, float, float]] = [
         "certificate-energy.md",
         "unexplained than 2e-4 of the largest energy",
         2e-4,
-        certificates.BROKEN_BALANCE_SHARE,
+        functional_judgements.BROKEN_BALANCE_SHARE,
     ),
     (
         "certificate-energy.md",
         "less than 1e-3 is unexplained",
         1e-3,
-        certificates.CLEAR_BREAK_SHARE,
+        functional_judgements.CLEAR_BREAK_SHARE,
     ),
     (
         "certificate-premises.md",
@@ -243,9 +242,9 @@ STATED: list[tuple[str, str, float, float]] = [
         "certificate-premises.md",
         "more than 1e-2 of the largest energy",
         1e-2,
-        certificates.COARSE_TOLERANCE_SHARE,
+        functional_judgements.COARSE_TOLERANCE_SHARE,
     ),
-    ("certificate.md", "to 1e-6 (1 + |tau|)", 1e-6, certificates.TORQUE_TOLERANCE),
+    ("certificate.md", "to 1e-6 (1 + |tau|)", 1e-6, functional_judgements.TORQUE_TOLERANCE),
     ("certificate.md", "`--min-coverage` (0.999)", 0.999, accounting.MIN_COVERAGE),
     ("stability.md", r"\le 0.01`$ rad/s in", 0.01, run_end.SETTLED_SPEED_RAD_S),
     ("stability.md", "and a tenth of the run", 0.1, run_end.LEAST_JUDGED_SHARE),

@@ -15,7 +15,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from trilat_ros2.ros2_bridge import refuse_other_robots
 
 import trilat_net
 from tests.log.builders import make_log_bytes, write_log
@@ -202,7 +201,7 @@ def test_robot_file_fits_its_scenario(example: str, file: str) -> None:
     scenario = trilat_net.load_scenario(LOOK.with_name(example))
     table = TopicTable.read(str(LOOK.with_name(file)))
     robot = table.robots["s"]
-    refuse_other_robots(table, scenario)
+    table.refuse_other_robots(scenario)
     joints = len(scenario.sites["s"].q0_rad)
     assert len(robot.joints) == len(robot.safe) == joints
     assert sorted(robot.controller) == sorted(robot.joints)

@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,7 +32,7 @@ from trilat_net.files import (
 )
 from trilat_net.log.log_file import LogFile, sync_folder
 from trilat_net.presentation.export import EXPORT_MANIFEST
-from trilat_net.work.study_folder import extend_file
+from trilat_net.work.study_folder import RunJournal
 
 
 def read_folder(folder: Path) -> dict[str, str]:
@@ -186,7 +187,7 @@ def test_every_written_text_states_its_line_ends() -> None:
     [
         lambda path: write_whole(path, b"1"),
         lambda path: create_file(path),
-        lambda path: extend_file(path),
+        lambda path: RunJournal[Any](path, "study", object, "make room"),
         lambda path: make_folder(path, may_be_link=False),
         lambda path: write_output(path, "1", folder=False, force=True),
         lambda path: write_output(path, "1", folder=True, force=True),

@@ -1,7 +1,7 @@
 """trilat-net: dual-user (trilateral) teleoperation over a real network.
 
-Two users each move a master arm, and a slave arm follows both of them. Each arm has a control
-loop of its own, and the loops exchange their states over a network with delay.
+Two users each move a master arm, and a slave arm follows both masters. Each arm has its own
+control loop, and the loops exchange their states over a network with delay.
 
     import trilat_net as tn
 
@@ -10,9 +10,9 @@ loop of its own, and the loops exchange their states over a network with delay.
     tn.certify(log)
 
 The control loop of an arm is the function `Site.step`. The same function runs live over a
-network, in virtual time, and again from the log of a run, so the numbers are the same to the
-last bit. Functions of this package return objects with `summary()`, `to_frame()` and
-`to_dict()`. docs/studies/python.md lists them all.
+network, in virtual time, and when a run is repeated from its log, so the results are
+bit-identical. The functions of this package return objects with `summary()`, `to_frame()` and
+`to_dict()`. They are listed in docs/studies/python.md.
 """
 
 import os as _os
@@ -127,7 +127,7 @@ _NAMES = {
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 """The module or package interface that defines each public name."""
 _PACKAGE_NAMES = " ".join(_PACKAGE_FUNCTIONS.values()).split()
-"""Public names that optional packages such as trilat-studies define."""
+"""Public names defined by optional packages such as trilat-studies."""
 __all__ = sorted(["__version__", *_MODULES, *_PACKAGE_NAMES])
 
 
@@ -135,8 +135,8 @@ def __getattr__(name: str) -> _Any:
     """Imports the module of a public name when the name is first used.
 
     Python calls this function for names that the package does not contain. Importing everything
-    at once would delay commands such as `trilat --help` by seconds, since Numba alone takes a
-    second. Other installed packages may add names (`entry_points`).
+    at once would delay commands such as `trilat --help` by seconds; Numba alone takes one
+    second. Other installed packages may add names (see `entry_points`).
 
     Raises:
         AttributeError: There is no such public name.
@@ -153,9 +153,8 @@ def __getattr__(name: str) -> _Any:
 def _is_added(name: str) -> bool:
     """Returns True if another installed package adds a name to `trilat_net`.
 
-    Before Python imports a submodule, it looks up an attribute of the same name. The names of
-    submodules are recognised by their files, because reading the entry points takes
-    milliseconds.
+    Python looks up an attribute of the same name before it imports a submodule. Submodule names
+    are recognised by their files, because reading the entry points takes milliseconds.
 
     Args:
         name: Name of the attribute.
@@ -173,11 +172,11 @@ def _is_added(name: str) -> bool:
 
 
 def _import_name(name: str) -> _Any:
-    """Imports a public function or class by its name, for example `trilat_net.simulate`.
+    """Imports a public function or class by name, for example `trilat_net.simulate`.
 
-    If a package that the function needs is missing, the result is a stand-in that raises
-    UsageError when it is called. Raising the error here would be wrong, because programs look
-    up names without using them (`hasattr`, `dir`, completion in an editor).
+    If a required package is missing, a stand-in is returned that raises UsageError when called.
+    The error is not raised here because programs also look up names without using them
+    (`hasattr`, `dir`, editor completion).
     """
     from .errors import UsageError
 
@@ -203,7 +202,7 @@ def _make_stand_in(name: str, problem: str) -> _Any:
 
     Args:
         name: Public name of the function or class that cannot be imported.
-        problem: Text of the error, which names the missing package.
+        problem: Error message, which names the missing package.
     """
     from .errors import UsageError
 

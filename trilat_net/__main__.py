@@ -1,12 +1,12 @@
 """Runs the command `trilat`, also as `python -m trilat_net`.
 
-`trilat stop` runs before the modules of the other commands are loaded, so that arms stop
+`trilat stop` is executed before the modules of the other commands are loaded, so arms stop
 without delay.
 
 Invariant:
-    - Text that is printed into a file or pipe is UTF-8 with POSIX line ends on every system, as
-      in all files that the program writes.
-    - A character that a terminal cannot show is replaced by its number.
+    - Output to a file or pipe is UTF-8 with POSIX line endings on every system, like all files
+      written by the program.
+    - A character that a terminal cannot display is replaced by its code.
 """
 
 import atexit
@@ -18,10 +18,10 @@ from contextlib import suppress
 
 
 def main() -> None:
-    """Runs the command given on the command line. This is the entry point of `trilat`.
+    """Runs the command given on the command line (entry point of `trilat`).
 
-    The command `trilat stop` is executed before the rest of the program is loaded, so that it
-    stops arms without delay.
+    The command `trilat stop` is executed before the rest of the program is loaded, so arms stop
+    without delay.
     """
     # With Python's default thresholds, garbage collection takes a ninth of the start-up time.
     gc.set_threshold(100_000, 20, 20)
@@ -48,9 +48,8 @@ def main() -> None:
 def _run() -> None:
     """Runs the command given on the command line.
 
-    Two commands are handled before the others are loaded: `stop`, so that arms stop without
-    delay, and the hidden command `start-processes`, which starts the processes of a session by
-    forking.
+    Two commands are handled before the others are loaded: `stop`, to stop arms without delay,
+    and the hidden command `start-processes`, which forks the processes of a session.
     """
     if sys.argv[1:2] == ["stop"]:
         if sys.platform == "linux":
@@ -83,12 +82,14 @@ def _run() -> None:
 
 
 def _exit_before_zenoh(code: int | None) -> None:
-    """Ends the process at once if the network library Zenoh is loaded.
+    """Ends the process immediately if the network library Zenoh is loaded.
 
-    Otherwise Python would shut down before the threads of Zenoh, which then abort the process.
+    Otherwise, Python would shut down before Zenoh's threads, which would then abort the
+    process.
 
     Args:
-        code: The exit code. None if an exception ends the process; Python then reports it.
+        code: The exit code. None if the process ends with an exception, which Python then
+            reports.
     """
     if code is not None and "zenoh" in sys.modules:
         with suppress(OSError):  # Python reports this error itself

@@ -1,14 +1,14 @@
 """Finds the commands, functions and viewers that other installed packages add to this program.
 
-For example, a package can add `trilat log lag`. The package lists the command in its
-pyproject.toml as an entry point, which is the name of an object (docs/develop/packages.md).
-This program reads the names without importing the package, and imports the object when somebody
-uses it. Optional packages of this program, such as trilat-studies, add their commands in the
-same way.
+For example, a package can add `trilat log lag` by listing the command in its pyproject.toml as
+an entry point, which names an object (docs/develop/packages.md). The names are read without
+importing the package, and the object is imported on first use. Optional packages of this
+program, such as trilat-studies, add their commands in the same way.
 
 Invariant:
-    - A name that this program defines itself is never replaced.
-    - A name of a package of this program is never taken from another package.
+    - A name defined by this program itself is never overridden.
+    - A name that belongs to one of this program's own packages is never loaded from another
+      package.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,13 +21,15 @@ from .errors import UsageError
 from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS, PACKAGE_HOOKS
 
 COMMANDS = "trilat_net.commands"
-"""Group of the commands. Each name is a command with a hyphen in place of each space."""
+"""Entry point group of commands. Each name is a command with hyphens in place of spaces."""
 FUNCTIONS = "trilat_net.api"
-"""Group of the functions and classes of the Python interface."""
+"""Entry point group of functions and classes of the Python interface."""
 VIEWS = "trilat_net.views"
-"""Group of the viewers in which `trilat log view --in` can open a log."""
+"""Entry point group of the viewers in which `trilat log view --in` can open a log."""
 HOOKS = "trilat_net.hooks"
-"""Group of the functions that `hooks` looks up in the optional packages of this program."""
+"""Entry point group of the functions that `hooks` looks up in the optional packages of this
+program.
+"""
 
 _PACKAGE_OF = {
     COMMANDS: {name: package for package, names in PACKAGE_COMMANDS.items() for name in names},
@@ -43,7 +45,7 @@ _PACKAGE_OF = {
 
 @cache
 def find_entries(group: str) -> dict[str, EntryPoint]:
-    """Returns the commands, functions or viewers that installed packages add, by their names.
+    """Returns the commands, functions or viewers added by installed packages, keyed by name.
 
     The packages are not imported. A name that belongs to an optional package of this program,
     such as trilat-studies, is accepted only from that package.
@@ -64,7 +66,7 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
 def find_package(group: str, name: str) -> str:
     """Returns the optional package, such as trilat-studies, that defines a name.
 
-    An error can then tell the user which package to install. The result is "" if no optional
+    Error messages use it to tell the user which package to install. Returns "" if no optional
     package defines the name.
 
     Args:
@@ -75,21 +77,21 @@ def find_package(group: str, name: str) -> str:
 
 
 def load_entry(group: str, name: str, use: str) -> Any:
-    """Imports a command, function or viewer that another installed package adds.
+    """Imports a command, function or viewer added by another installed package.
 
     Packages declare such additions as entry points in their metadata.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.
         name: Name of the entry point.
-        use: How a user calls the object, as in "trilat sweep", for the error message.
+        use: How a user calls the object, for example "trilat sweep", for the error message.
 
     Returns:
-        The object, or None if there is no such name.
+        The object, or None if there is no entry point of that name.
 
     Raises:
-        UsageError: The optional package that defines the name is not installed, or another
-            author's package cannot be imported.
+        UsageError: The optional package that defines the name is not installed, or a
+            third-party package cannot be imported.
     """
     entry = find_entries(group).get(name)
     package = find_package(group, name)
@@ -111,13 +113,14 @@ def load_entry(group: str, name: str, use: str) -> Any:
 def find_viewer(name: str) -> Callable[[Sequence[Path]], None]:
     """Returns the function with which another package displays logs (group `VIEWS`).
 
-    The function takes the paths of the files of a log, and returns once the log is displayed.
+    The function takes the paths of the log files, and returns once the log is displayed.
 
     Args:
         name: Name of the viewer.
 
     Raises:
-        UsageError: No installed package has a viewer of that name, or it cannot be imported.
+        UsageError: No installed package provides a viewer of that name, or the viewer cannot be
+            imported.
     """
     show_logs: Callable[[Sequence[Path]], None] | None = load_entry(
         VIEWS, name, f"the viewer {name}"

@@ -1,16 +1,16 @@
-"""The error classes of the program, and helpers for the wording of messages.
+"""Error classes of the program, and helpers for the wording of messages.
 
 The classes distinguish who has to act: the author of a scenario, the caller of a function, the
 operator of another machine, the owner of a file, or the developers of this program.
 
 Invariant:
-    - An error contains its data and one sentence that names the problem, its location and the
-      remedy. The command line prints that sentence and nothing else.
-    - Each class has an `exit_code`, with which a command ends after this error.
-    - Messages are written for the command line, and name its options. Outside of a command, the
-      same messages name the arguments of the Python functions instead.
-    - Each text that counts things uses `count_nouns`, as in "1 record" and "2 records"
-      (`tests/test_wording.py`).
+    - An error contains its data and one sentence that states the problem, its location and the
+      remedy. The command line prints only that sentence.
+    - Each class has an `exit_code`, which is the exit code of a command after this error.
+    - Messages are written for the command line and refer to its options. Outside a command, the
+      same messages refer to the arguments of the Python functions instead.
+    - Every message that contains a count uses `count_nouns`, for example "1 record" and "2
+      records" (`tests/test_wording.py`).
 """
 
 import os
@@ -27,7 +27,7 @@ _OTHER_CODE = (
     _PROGRAM / "packages",
     Path(os.__file__).parent,
 )
-"""Folders of this program and of Python's standard library."""
+"""Folders that contain this program and Python's standard library."""
 _OPTION = re.compile(
     r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?"
 )
@@ -44,14 +44,14 @@ _ARGUMENTS = {
     "--gravity": "gravity_percent",
     "--at": "at_s",
 }
-"""Python arguments whose names cannot be derived from the names of their options."""
+"""Python arguments whose names cannot be derived from the option names."""
 
 
 def _name_argument(match: re.Match[str]) -> str:
     """Returns the Python argument that corresponds to an option in a message.
 
     For example, "--min-coverage 0.9" becomes "min_coverage=0.9", and "--force" becomes
-    "force=True". A whole command such as "trilat log recover run.mcap" is not changed.
+    "force=True". A complete command such as "trilat log recover run.mcap" is left unchanged.
 
     Args:
         match: A match of `_OPTION`.
@@ -66,15 +66,17 @@ def _name_argument(match: re.Match[str]) -> str:
 
 
 class TrilatError(Exception):
-    """Base class of the errors that a user can correct, such as a wrong argument.
+    """Base class for errors that a user can correct, such as an invalid argument.
 
-    The command line prints the message without a traceback, and ends with the exit code
-    `exit_code` of the class. Any other exception is a bug of the program.
+    The command line prints the message without a traceback and exits with the class's
+    `exit_code`. Any other exception is a bug in the program.
     """
 
     exit_code = 1
     in_command: ClassVar[bool] = False
-    """True in a process that runs a command, so that messages name options, not arguments."""
+    """True in a process that runs a command, where messages refer to options rather than
+    arguments.
+    """
 
     def __str__(self) -> str:
         # KeyError.__str__ would quote the text.
@@ -83,24 +85,24 @@ class TrilatError(Exception):
 
 
 class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
-    """A name that a result does not contain, for example of an arm that is not in a log.
+    """A name that does not exist in a result, for example of an arm that is not in a log.
 
-    The error is also a KeyError, so a result behaves like a dictionary in this respect.
+    This is also a KeyError, so that a result behaves like a dictionary.
     """
 
     exit_code = 2
 
 
 class ScenarioError(TrilatError):
-    """A scenario (description of an experiment), override or argument with an invalid value.
+    """An invalid value in a scenario, override or argument.
 
-    The author has to correct the value; the message suggests how.
+    The author has to correct the value, and the message suggests how.
 
     Args:
         problem: The problem and its remedy.
-        path: Dotted path of the wrong key, as in "sites.m1.control.Kd". Empty if no single key
-            is wrong.
-        source: File or name of the scenario. Empty if it is unknown.
+        path: Dotted path of the invalid key, for example "sites.m1.control.Kd". Empty if no
+            single key is at fault.
+        source: File or name of the scenario. Empty if unknown.
     """
 
     exit_code = 2
@@ -114,34 +116,34 @@ class ScenarioError(TrilatError):
 
 
 class CodeWithheld(ScenarioError):  # noqa: N818 - it names an outcome
-    """A user's code that a log names, but that is not allowed to run on this machine.
+    """User code named in a log that is not allowed to run on this machine.
 
-    The code is a control law, an operator (a program that moves an arm), or a plant (a
-    simulation of an arm). The user of this machine has to allow it first, because a log from
-    somebody else may name harmful code.
+    The code is a control law, an operator (a program that moves an arm) or a plant (a
+    simulation of an arm). The user of this machine must allow it first, because a log from
+    another person may name harmful code.
     """
 
     exit_code = 4
 
 
 class UsageError(TrilatError):
-    """Arguments that contradict each other, or that cannot work on this machine.
+    """Arguments that are contradictory, or that cannot work on this machine.
 
-    Examples are a port that is in use and an output file that exists already.
+    Examples are a port that is in use and an output file that already exists.
     """
 
     exit_code = 2
 
 
 class WireError(TrilatError):
-    """Network message from another machine that is not a valid message of this program.
+    """A network message from another machine that is not a valid message of this program.
 
     The receiver drops the message and counts it. The sender may be another program, or another
     version of this one.
 
     Args:
-        reason: Category of the problem, under which rejected payloads are counted.
-        detail: What is wrong with this payload, for the error message.
+        reason: Category under which the rejected payload is counted.
+        detail: Description of the problem, for the error message.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -150,37 +152,35 @@ class WireError(TrilatError):
 
 
 class SessionError(TrilatError):
-    """A live session of several arms' processes that cannot start.
+    """A live session that cannot start.
 
-    For example, a process is missing or runs another experiment, or the session is running
-    already.
+    For example, a process is missing or runs a different scenario, or the session is already
+    running.
     """
 
     exit_code = 2
 
 
 class LogError(TrilatError):
-    """A log that is missing, incomplete, or not written by this program.
-
-    A log is the MCAP file with the recorded data of a run.
-    """
+    """A log (the MCAP file of a run) that is missing, incomplete, or not from this program."""
 
     exit_code = 2
 
 
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
-    """An output that the disk refused to store, for example because the disk is full.
+    """Output that could not be written, for example because the disk is full.
 
-    Log data that was written before the failure is kept and can be read.
+    Log data written before the failure is kept and remains readable.
     """
 
     exit_code = 5
 
 
 class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
-    """A run that cannot be computed again from its log.
+    """A run that cannot be recomputed from its log.
 
-    The message gives the reason, for example that the log lacks the data that an arm received.
+    The message states the reason, for example that the data received by an arm are missing from
+    the log.
     """
 
 
@@ -191,7 +191,7 @@ class NothingSaved(LogError):  # noqa: N818 - it names an outcome
 
 
 class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit summary does
-    """A run, or a comparison of runs, that was completed but had a bad outcome.
+    """A run, or a comparison of runs, that completed with a bad outcome.
 
     For example, an arm became unstable, a process died, or two runs that should be equal
     differ.
@@ -199,7 +199,7 @@ class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit s
 
 
 class PeerLeft(RunFailed):
-    """A live run that ended early, because another arm's process left and did not come back."""
+    """A live run that ended early because another site left and did not come back."""
 
     exit_code = 3
 
@@ -212,9 +212,9 @@ class CodeFailed(RunFailed):
     Args:
         problem: The failure.
         site: Name of the site that ran the code.
-        code: The class, as in "package.module:Law".
-        tick: Tick (period of the control loop) in which the code failed. None if the code
-            failed while its state was restored, before any tick.
+        code: The class, for example "package.module:Law".
+        tick: Tick in which the code failed. None if the code failed before any tick, while its
+            state was being restored.
     """
 
     kind: ClassVar[str] = "code"
@@ -228,7 +228,7 @@ class CodeFailed(RunFailed):
         self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Returns what pickle needs to rebuild the error with all its facts.
+        """Returns the data from which pickle rebuilds the error with all its attributes.
 
         Worker processes use pickle to report errors to the process that started them.
         """
@@ -237,32 +237,26 @@ class CodeFailed(RunFailed):
 
 
 class LawFailed(CodeFailed):
-    """A user's control law that raised an exception, was too slow, or returned bad results.
-
-    A control law is the class that computes the torques of an arm.
-    """
+    """A user's control law that raised an exception, was too slow, or returned bad results."""
 
     kind = "law"
 
 
 class PlantFailed(CodeFailed):
-    """A user's arm model that raised an exception, was too slow, or returned bad results.
-
-    The model is called a plant: a class that computes the motion of an arm from its torques.
-    """
+    """A user's arm model that raised an exception, was too slow, or returned bad results."""
 
     kind = "plant"
 
 
 class RuntimeFault(TrilatError):  # noqa: N818 - programs catch it by this name
-    """A state that the program must never reach. It means that the program has a bug.
+    """A state that the program must never reach, which indicates a bug in the program.
 
-    Users cannot correct the bug, and should report it.
+    Users cannot correct the problem themselves, and should report it.
     """
 
 
 def count_nouns(count: object, singular: str, plural: str = "") -> str:
-    """Returns a number followed by the noun that it counts, in the singular or the plural.
+    """Returns a number followed by a noun in the singular or plural form.
 
     >>> count_nouns(1, "record"), count_nouns(2, "record")
     ('1 record', '2 records')
@@ -270,9 +264,9 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
     '1 mark waits'
 
     Args:
-        count: The number, or its text, as in "1,000".
-        singular: The noun, possibly with words before it, as in "late sample".
-        plural: The noun for other numbers. By default the regular plural of `singular`.
+        count: The number, or its formatted string, for example "1,000".
+        singular: The noun, possibly preceded by other words, for example "late sample".
+        plural: The plural form. Defaults to the regular plural of `singular`.
     """
     if str(count) == "1":
         return f"{count} {singular}"
@@ -280,9 +274,9 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
 
 
 def format_wall_time(seconds: float) -> str:
-    """Returns a duration as a string with a readable unit, as in "2.5 h".
+    """Formats a duration in s with a readable unit, for example "2.5 h".
 
-    Durations of at least 1.5 min, 1.5 h or 2 days are given in minutes, hours or days.
+    Durations of at least 1.5 min, 1.5 h or 2 days are expressed in minutes, hours or days.
 
     Args:
         seconds: The duration, in s.
@@ -295,10 +289,10 @@ def format_wall_time(seconds: float) -> str:
 
 
 def _pluralise(singular: str) -> str:
-    """Returns the plural of an English noun, as in "samples" for "sample" or "axes" for "axis".
+    """Returns the plural of an English noun, for example "axes" for "axis".
 
     Args:
-        singular: The noun, possibly with words before it, as in "late sample".
+        singular: The noun, possibly preceded by other words, for example "late sample".
 
     Returns:
         The same words, with the last word in the plural.
@@ -320,12 +314,12 @@ MOST_LETTERS = 80
 MOST_COMPARED = 500
 """Largest number of words that `suggest_nearest` compares.
 
-The computing time grows faster than the product of the number of words and their length.
+The computing time grows faster than the number of words times their length.
 """
 
 
 _UNIT_ENDINGS = ("deg", "hz", "kg", "m", "ms", "n", "nm", "ns", "rad", "s", "us")
-"""Units that may end a key, in lower case."""
+"""Units with which a key may end, in lower case."""
 
 
 def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
@@ -339,23 +333,23 @@ def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = 
     Args:
         word: The unknown word.
         valid: The valid words.
-        elsewhere: Dotted paths of words that are valid in other places. The last part of a path
-            is compared with the word, and the whole path is suggested.
+        elsewhere: Dotted paths of words that are valid in other places. The last component of a
+            path is compared with the word, and the complete path is suggested.
 
     Returns:
-        The end of an error message, as in "; did you mean 'delay_ms'?". Empty if no valid word
-        is similar, or if the word is too long to compare.
+        The end of an error message, for example "; did you mean 'delay_ms'?". Empty if no valid
+        word is similar, or if the word is too long to compare.
     """
     nearest = find_nearest(word, valid, elsewhere)
     return f"; did you mean {nearest!r}?" if nearest else ""
 
 
 def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
-    """Returns the valid word that a user probably meant by an unknown word.
+    """Returns the valid word that a user probably meant instead of an unknown word.
 
-    The arguments are those of `suggest_nearest`. Upper and lower case count as equal. A word
-    that differs only in case has priority: first among the words `valid`, then among
-    `elsewhere`. The result is empty if no word is similar.
+    Takes the same arguments as `suggest_nearest`. The comparison ignores case. Words that
+    differ only in case have priority, first those in `valid`, then those in `elsewhere`.
+    Returns "" if no word is similar.
     """
     if len(word) > MOST_LETTERS:
         return ""
@@ -384,13 +378,13 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
 
 
 def _prepare_choices(suggestions: Mapping[str, str]) -> dict[str, str]:
-    """Returns the words to compare with a misspelt word, each with the text to suggest.
+    """Returns a mapping from the words to compare with a misspelt word to the suggestions.
 
-    Upper and lower case count as equal. Users also forget the unit at the end of a key: "delay"
-    and "dely" mean "delay_ms". Therefore each key is listed with and without its unit.
+    The comparison ignores case. Users also tend to forget the unit at the end of a key ("delay"
+    or "dely" for "delay_ms"), so each key is listed with and without its unit.
 
     Args:
-        suggestions: The text to suggest for each valid word.
+        suggestions: Mapping from valid word to the string to suggest.
     """
     choices: dict[str, str] = {}
     for word, suggestion in suggestions.items():
@@ -404,9 +398,9 @@ def _prepare_choices(suggestions: Mapping[str, str]) -> dict[str, str]:
 
 
 def join_words(words: Iterable[str]) -> str:
-    """Joins words into a list for a sentence, such as "m1, m2 and s" or "m1 and s".
+    """Joins words into a list for a sentence, for example "m1, m2 and s" or "m1 and s".
 
-    The result is empty if there are no words.
+    Returns "" if there are no words.
     """
     texts = list(words)
     if len(texts) < 2:
@@ -415,10 +409,10 @@ def join_words(words: Iterable[str]) -> str:
 
 
 def join_arguments(arguments: Iterable[str]) -> str:
-    """Returns a command line with quotes where a shell needs them, for users to copy.
+    """Returns a command line that users can copy, quoted where a shell requires it.
 
-    The quoting is that of this operating system. For example, "links.m1->s.loss=0" is quoted,
-    because a shell would take ">" as the redirection of output.
+    Quoting follows the rules of the current operating system. For example, "links.m1->s.loss=0"
+    is quoted because a shell would interpret ">" as output redirection.
 
     Args:
         arguments: Name of the program and its arguments.
@@ -435,10 +429,10 @@ def join_arguments(arguments: Iterable[str]) -> str:
 
 
 def describe_exception(error: BaseException) -> str:
-    """Describes an exception in a user's code in one line, with the place where it was raised.
+    """Describes an exception in user code in one line, including where it was raised.
 
-    The place is the innermost line that belongs neither to this program nor to a library. For
-    example: "NameError: name 'nw' is not defined (mylaw.py, line 14)".
+    The location is the innermost line that belongs neither to this program nor to a library.
+    For example: "NameError: name 'nw' is not defined (mylaw.py, line 14)".
 
     Args:
         error: The exception.
@@ -446,7 +440,7 @@ def describe_exception(error: BaseException) -> str:
     kind = type(error).__name__
     lines = str(error).strip().splitlines()
     text = f"{kind}: {lines[0]}" if lines else kind
-    # The message of a syntax error already names the place.
+    # The message of a syntax error already states the location.
     if isinstance(error, SyntaxError):
         return text
     # Imported here, because `trilat stop` imports this module and describes no exception.
@@ -462,12 +456,12 @@ def describe_exception(error: BaseException) -> str:
 
 
 def _is_users_file(name: str) -> bool:
-    """Returns True if a source file belongs to a user, not to this program or a library.
+    """Returns True if a source file belongs to a user rather than to this program or a library.
 
-    The place of an error is reported in the user's file, where it can be corrected.
+    Errors are reported at a location in the user's file, where they can be corrected.
 
     Args:
-        name: Name of the file in a traceback. Code without a file has the name "<string>".
+        name: File name from a traceback, which is "<string>" for code without a file.
     """
     file = Path(name)
     if name.startswith("<") or "site-packages" in file.parts:

@@ -1,8 +1,8 @@
-"""Defines the names that other packages import to add commands to `trilat`.
+"""Public interface for packages that add commands to `trilat`.
 
 A package declares the function of its command with `command`, and registers the command as an
-entry point (docs/develop/packages.md). The names of this module and of `trilat_net` stay the
-same in later versions. All other modules of this program may change.
+entry point (docs/develop/packages.md). The names in this module and in `trilat_net` are stable
+across versions. All other modules of this program may change.
 """
 
 from .app.cli.options import (

@@ -1,14 +1,14 @@
-"""Defines the types of the values in a scenario, and the base class of its tables.
+"""Types of the values in a scenario, and the base class of its tables.
 
 A scenario is a TOML file that describes an experiment with several robot arms. Each of its
-tables becomes an object of a subclass of `Frozen`. Annotations say what a value may be:
+tables is converted to an instance of a subclass of `Frozen`. Annotations restrict the values:
 `Positive` limits the range of a number, and `Joints` requires one number per joint of the arm.
-`scenario.key_checks` checks the rules that these types cannot state.
+Rules that these types cannot express are checked by `scenario.key_checks`.
 
 Invariant:
     - An error names the path of the key as the author of the scenario wrote it.
-    - No quantity of an arm, no gain and no torque exceeds `MAX_QUANTITY`. Products of a few of
-      them are therefore far from overflow.
+    - No arm quantity, gain or torque exceeds `MAX_QUANTITY`, which keeps products of a few of
+      them far from overflow.
 """
 
 import pkgutil
@@ -25,9 +25,9 @@ from .records import MAX_JOINTS
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base class of the immutable types to which the tables of a scenario file are converted.
+    """Base class of the immutable types that represent the tables of a scenario.
 
-    An unknown key in a table is refused, because it is probably misspelt and would otherwise
+    Unknown keys in a table are rejected, because they are probably misspelt and would otherwise
     have no effect.
     """
 
@@ -35,9 +35,9 @@ class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     def find_kinds(cls, package: str) -> Iterator[type[Self]]:
         """Yields the subclasses that a scenario can select by name, as in `kind = "wall"`.
 
-        To add a kind, add a file to the package; there is no other list. Classes without a tag
-        (name) of their own serve only as base classes, and are left out. The classes are in the
-        order of their files, and of their positions in each file.
+        A new kind is added by adding a file to the package. Classes without a tag (name) of
+        their own serve only as base classes and are skipped. The classes are ordered by file,
+        and by position within each file.
 
         Args:
             package: Dotted name of the package whose files are searched.
@@ -58,7 +58,7 @@ class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 MAX_QUANTITY = 1e9
-"""Largest absolute value of the quantities of a scenario."""
+"""Largest absolute value of any quantity in a scenario."""
 
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
@@ -85,11 +85,11 @@ TomlTable = dict[str, Any]
 
 
 class KeyProblem(NamedTuple):
-    """Problem with one key in a table of a scenario, from which an error message is made.
+    """A problem with one key of a scenario table, used to build an error message.
 
     Attributes:
-        key: Path of the key below the checked table. Empty for the table itself.
-        problem: The problem, as the end of a sentence about the key.
+        key: Path of the key relative to the checked table. Empty for the table itself.
+        problem: The problem, phrased as the end of a sentence about the key.
     """
 
     key: str
@@ -97,15 +97,16 @@ class KeyProblem(NamedTuple):
 
 
 def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
-    """Splits an error message about an invalid scenario into the problem and its place.
+    """Splits an error message about an invalid scenario into the problem and its location.
 
-    The library msgspec raises the error when it converts the tables of the scenario file.
+    The error is raised by the msgspec library while converting the tables of the scenario.
 
     Args:
         error: The error, with a message such as "Expected `float` - at `$.sites.m1`".
 
     Returns:
-        The problem and the path of the wrong value, such as "Expected `float`" and ".sites.m1".
+        The problem and the path of the invalid value, such as "Expected `float`" and
+        ".sites.m1".
     """
     problem, _, path = str(error).partition(" - at ")
     return problem, path.strip("`$")
@@ -119,21 +120,21 @@ _TYPE_NAMES = {
     "array": "a list",
     "object": "a table",
 }
-"""The TOML name of each type, by the name that msgspec uses."""
+"""Mapping from the type names of msgspec to those of TOML."""
 WITHOUT_QUOTES = ": write it without quotes and unit, which the key's name states"
 
 
 def reword_problem(problem: str) -> str:
-    """Rewords an error message of the library msgspec, for the author of a scenario file.
+    """Rewords an error message of the msgspec library for the author of a scenario.
 
-    The library names types of Python and JSON, such as "object"; an author knows those of TOML,
-    such as "a table".
+    The library uses the type names of Python and JSON, such as "object", whereas authors know
+    those of TOML, such as "a table".
 
     Args:
         problem: The message, without the path of the key.
 
     Returns:
-        The reworded message. A message without terms of msgspec is returned unchanged.
+        The reworded message. Messages that contain no msgspec terms are returned unchanged.
     """
     problem = re.sub("`([^`]*)`", _reword_types, problem)
     if problem.startswith("Expected "):
@@ -144,12 +145,12 @@ def reword_problem(problem: str) -> str:
 
 
 def _reword_types(quoted: re.Match[str]) -> str:
-    """Replaces the names of types in an error of msgspec by those that authors of TOML know.
+    """Replaces type names in an msgspec error with those known to authors of TOML.
 
-    Example: "`float | null`" becomes "a number". Null is left out, because TOML has no null.
+    For example, "`float | null`" becomes "a number". Null is omitted because TOML has no null.
 
     Args:
-        quoted: Match of the quoted types. Group 1 is the text between the backquotes.
+        quoted: Match of the quoted types, with the text between the backquotes in group 1.
     """
     types = quoted[1].split(" | ")
     return " or ".join(_TYPE_NAMES.get(name, name) for name in types if name != "null")
@@ -173,13 +174,13 @@ UNITS = {
     "nm_rad": "N m/rad",
     "nm_s_rad": "N m s/rad",
 }
-"""The unit for each ending of a name, such as "ms" for delay_ms."""
+"""Mapping from the ending of a name to its unit, for example "ms" for delay_ms."""
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Splits the name of a quantity into its words and its unit, as for the axis of a figure.
+    """Splits the name of a quantity into its words and its unit, for example for an axis label.
 
-    If several endings of the name are units, the longest one counts.
+    If several endings of the name are units, the longest one is used.
 
     >>> split_unit("contact_stiffness_n_m")
     ('contact stiffness', 'N/m')
@@ -188,7 +189,8 @@ def split_unit(name: str) -> tuple[str, str]:
         name: The name, with words and unit separated by underscores.
 
     Returns:
-        The words, separated by spaces, and the unit. The unit is empty if the name has none.
+        The words, separated by spaces, and the unit. The unit is empty if the name does not end
+        in one.
     """
     words = name.split("_")
     for word_count in range(1, len(words)):

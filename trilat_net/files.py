@@ -1,15 +1,15 @@
 """Writes output files safely, checks input files, and imports optional packages.
 
-Commands write their results with these helpers, so that a crash or a mistyped path does not
+Commands use these helpers to write their results, so a crash or a mistyped path does not
 destroy earlier results.
 
 Invariant:
-    - An existing output is replaced only if the caller allows it with `force`.
-    - A file or folder gets its final name only when it is complete. A program that dies while
-      it writes therefore leaves no output that looks complete.
+    - An existing output is replaced only if the caller passes `force`.
+    - A file or folder gets its final name only when it is complete. A program that is killed
+      while writing therefore leaves no output that looks complete.
     - An output is never written through a symbolic link, not even inside an output folder.
-      Otherwise, the author of the link could choose which file is overwritten.
-    - An optional package is imported where it is used. If it is missing, the error names the
+      Otherwise, whoever created the link could choose which file is overwritten.
+    - An optional package is imported where it is used. If it is missing, the error states the
       command that installs it.
 """
 
@@ -34,9 +34,12 @@ from .errors import LogError, LogRefused, TrilatError, UsageError
 from .package_names import PACKAGE_COMMANDS
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-"""Numbers of the system errors of a disk that accepts no more data, for example a full disk."""
+"""Error numbers that indicate that a disk accepts no more data, for example because it is full.
+"""
 STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
-"""Libraries that `trilat-net` installs and `trilat-net-core` does not (pyproject.toml)."""
+"""Libraries that are installed with `trilat-net` but not with `trilat-net-core`
+(pyproject.toml).
+"""
 
 EXTRAS = {
     "dask": "cluster",
@@ -49,19 +52,22 @@ EXTRAS = {
     "rerun": "view",
     "statsmodels": "stats",
 }
-"""For each optional library, the extra of trilat-net that installs it (pyproject.toml)."""
+"""Mapping from optional library to the extra of trilat-net that installs it (pyproject.toml).
+"""
 
 
 def require_libraries(*names: str) -> None:
-    """Checks, before a long command starts, that all libraries it needs are installed.
+    """Raises UsageError if a library required by a command is not installed.
 
-    Otherwise the command would fail only at its end, for example when it draws a figure.
+    Called at the start of a long command, which would otherwise fail only at its end, for
+    example when drawing a figure.
 
     Args:
-        names: Names of the libraries. By default all of `STUDY_LIBRARIES`.
+        names: Names of the libraries. Defaults to all of `STUDY_LIBRARIES`.
 
     Raises:
-        UsageError: A library is not installed. The message has the command that installs it.
+        UsageError: A library is not installed. The message contains the command that installs
+            it.
     """
     required = names or STUDY_LIBRARIES
     missing = [name for name in required if find_spec(name) is None]
@@ -78,10 +84,10 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
 
     Args:
         function: Name of the function.
-        error: Error of the import. It names the missing module.
+        error: The import error, which names the missing module.
 
     Returns:
-        The message, with the command that installs the library.
+        The message, including the command that installs the library.
 
     Raises:
         ModuleNotFoundError: The missing module belongs to this program, which is a bug.
@@ -105,20 +111,21 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
 def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Imports a module of an optional package, which may not be installed.
 
-    Without the package, the user gets an error with the command that installs it, in place of a
-    traceback.
+    If the package is missing, the user gets an error that contains the install command, instead
+    of a traceback.
 
     Args:
         module: Name of the module.
         extra: Name of the extra of trilat-net that installs the package, as in
             `trilat-net[extra]`.
-        purpose: The features that need the package, in the plural, for the error.
+        purpose: The features that need the package, in the plural, for the error message.
 
     Returns:
         The module.
 
     Raises:
-        UsageError: The package is not installed. The message has the command that installs it.
+        UsageError: The package is not installed. The message contains the command that installs
+            it.
     """
     try:
         return import_module(module)
@@ -131,12 +138,12 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
 
 
 def format_extra_install(extra: str) -> str:
-    """Returns the shell command that installs an extra in the environment of this program.
+    """Returns the shell command that installs an extra in the current environment.
 
-    - In the `.venv` of a clone of the repository, the command is a target of the clone's
-      Makefile, which installs locked versions.
-    - In another environment that uses a clone, the command is pip with the path of the clone.
-    - Anywhere else, the command is pip with the name of the distribution.
+    - In the `.venv` of a repository clone, the command is a target of the clone's Makefile,
+      which installs locked versions.
+    - In any other environment that uses a clone, the command is pip with the path of the clone.
+    - Otherwise, the command is pip with the name of the distribution.
 
     Args:
         extra: Name of the extra, a group of optional packages, as in `trilat-net[extra]`.
@@ -166,16 +173,17 @@ def find_version() -> str:
 
 
 def find_page(name: str) -> Path:
-    """Returns the path of a documentation page on this machine.
+    """Returns the local path of a documentation page.
 
-    In a clone of the repository, the pages are in the folder docs. Otherwise, they are where
-    the installation put them.
+    In a repository clone, the pages are in the folder docs. Otherwise, they are in the location
+    chosen by the installer.
 
     Args:
-        name: File name of the page, as in "json.md". No two pages have the same name.
+        name: File name of the page, for example "json.md". File names are unique.
 
     Returns:
-        The path. If there is no such page, the path that it would have in the installation.
+        The path of the page. If the page does not exist, the path that it would have in the
+        installation.
     """
     installed = Path(sys.prefix) / "share" / "doc" / "trilat-net"
     for folder in (Path(__file__).parents[1] / "docs", installed):
@@ -185,13 +193,14 @@ def find_page(name: str) -> Path:
 
 
 def open_regular(path: Path, **options: Any) -> Any:
-    """Opens a file for reading, and rejects folders, pipes and devices.
+    """Opens a regular file for reading. Folders, pipes and devices are rejected.
 
-    Pipes and devices are rejected because reading them might never end.
+    Reading a pipe or device might never end.
 
     Args:
         path: The file.
-        options: Further arguments of `open`. With `encoding`, the file is opened as text.
+        options: Further arguments for `open`. If `encoding` is given, the file is opened in
+            text mode.
 
     Raises:
         OSError: The path is a folder, a pipe or a device, or cannot be opened.
@@ -222,10 +231,10 @@ def open_regular(path: Path, **options: Any) -> Any:
 
 @contextmanager
 def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO]:
-    """Opens a file for reading, as a context manager that converts errors.
+    """Context manager that opens a file for reading, and converts errors.
 
-    Errors of the operating system become errors that a user can act on. Pipes and devices are
-    rejected, because reading them might never end.
+    Errors of the operating system are converted to errors that a user can act on. Pipes and
+    devices are rejected, because reading them might never end.
 
     Args:
         path: The file.
@@ -245,10 +254,10 @@ def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO
 
 
 def digest_file(path: Path) -> str:
-    """Returns the SHA-256 hash of a file's content in hexadecimal, to detect changes.
+    """Returns the SHA-256 hash of a file's contents in hexadecimal.
 
     Args:
-        path: The file. It may be large, because it is read in parts.
+        path: The file, which may be large because it is read in chunks.
     """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -257,8 +266,8 @@ def digest_file(path: Path) -> str:
 def read_foreign_permissions(path: Path) -> int:
     """Returns the permission bits that a file grants to its group and to all other users.
 
-    A file with a secret should grant no such permissions. The result is 0 on Windows, which has
-    access control lists instead.
+    A file that contains a secret should grant none. Returns 0 on Windows, which uses access
+    control lists instead.
 
     Args:
         path: The file.
@@ -267,13 +276,14 @@ def read_foreign_permissions(path: Path) -> int:
 
 
 def make_folder(folder: Path, *, may_be_link: bool = True) -> Path:
-    """Creates a folder, with all parent folders that do not exist yet, and returns its path.
+    """Creates a folder and any missing parent folders, and returns its path.
 
-    A folder that exists is left as it is.
+    An existing folder is left unchanged.
 
     Args:
         folder: Path of the folder.
-        may_be_link: False to reject a symbolic link, as for a folder inside an output folder.
+        may_be_link: False to reject a symbolic link, for example for a folder inside an output
+            folder.
 
     Raises:
         UsageError: The path is a symbolic link that is not allowed, or the folder cannot be
@@ -292,13 +302,13 @@ def make_folder(folder: Path, *, may_be_link: bool = True) -> Path:
 
 
 SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
-"""Folders in which the system itself makes symbolic links, for example /dev/stdout."""
+"""Folders in which the system itself creates symbolic links, for example /dev/stdout."""
 
 
 def refuse_link(path: Path) -> None:
-    """Checks that an output path is not a symbolic link.
+    """Raises UsageError if an output path is a symbolic link.
 
-    Another user could have created the link. The output would then replace a file elsewhere.
+    Another user could have created the link, and the output would replace a file elsewhere.
 
     Args:
         path: The output path.
@@ -316,17 +326,17 @@ def refuse_link(path: Path) -> None:
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
     """Creates a folder for the results of a command, or uses an existing folder.
 
-    An existing folder must be empty, unless the user permits other files in it.
+    An existing folder must be empty unless the user permits other files in it.
 
     Args:
         folder: The folder. If None, the next free folder `runs/NAME-N` is used.
-        name: The text for NAME in this path.
-        force: True if the folder may contain files. If False, files are an error, which
-            suggests the option --force. If None, files are also an error; use it for a command
-            without this option.
+        name: NAME in this path.
+        force: True if the folder may contain files. If False, files cause an error that
+            suggests the option --force. If None, files also cause an error, but without this
+            suggestion, for commands that do not have the option.
 
     Returns:
-        The folder.
+        Path of the folder.
 
     Raises:
         UsageError: The folder contains files that are not permitted, or cannot be created.
@@ -347,7 +357,7 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
 def _make_next_folder(name: str) -> Path:
     """Creates the next free folder `runs/NAME-N`, and returns its path.
 
-    No other process gets the same folder, because creating an existing folder fails.
+    No two processes get the same folder, because creating an existing folder fails.
     """
     for n in itertools.count(1):
         folder = Path("runs") / f"{name}-{n:03d}"
@@ -364,18 +374,18 @@ def _make_next_folder(name: str) -> Path:
 def refuse_existing(
     path: Path, *, force: bool, unfinished: Path | None = None, manifest: str | None = None
 ) -> None:
-    """Checks that an output path is free, so that no earlier output is overwritten.
+    """Raises UsageError if an output would overwrite something.
 
     An empty folder is accepted as the path of an output folder. With `force`, an earlier output
-    of the same kind is accepted too, but never another kind of file or folder.
+    of the same kind is also accepted, but no other file or folder.
 
     Args:
         path: Path of the output, which is a file or a folder.
         force: True if an earlier output of the same kind may be replaced.
-        unfinished: Path of the output while it is being written. It must be free as well. None
+        unfinished: Path of the output while it is being written, which must also be free. None
             if the output has no such path.
-        manifest: Name of a file that every output folder of this kind contains, so that it is
-            recognised as an earlier output. None if the output is a file.
+        manifest: Name of a file contained in every output folder of this kind, which identifies
+            an earlier output. None if the output is a file.
 
     Raises:
         UsageError: Something exists at the path, or the path is a symbolic link.
@@ -404,7 +414,7 @@ def refuse_existing(
 def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
     """Renames a completely written file to its final name.
 
-    Readers therefore never see an incomplete file under that name.
+    Readers never see an incomplete file under that name.
 
     Args:
         unfinished: Path of the complete file, in the same folder.
@@ -412,7 +422,7 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
         force: True to replace an existing file.
 
     Raises:
-        UsageError: Another program has meanwhile created a file at the path.
+        UsageError: Another program has created a file at the path in the meantime.
     """
     if force:
         unfinished.replace(path)
@@ -439,23 +449,23 @@ def write_whole(
     remedy: str = "",
     mode: int = 0o666,
 ) -> None:
-    """Writes a file in one step, so that readers never see an incomplete file.
+    """Writes a file atomically, so that readers never see an incomplete file.
 
-    The data is written to a temporary file in the same folder, which then replaces the file. A
-    device or a pipe is written directly. A symbolic link is rejected. If a link appears later,
-    the link is replaced, and its target is not changed.
+    The data is written to a temporary file in the same folder, which then replaces the file.
+    Devices and pipes are written directly. A symbolic link is rejected, and a link created
+    after this check is replaced without touching its target.
 
     Args:
         path: The file.
-        data: Its content. Text is encoded as UTF-8. An iterable yields the parts of a text that
-            may be too large for the memory.
+        data: The contents. Text is encoded as UTF-8. An iterable yields the parts of a text
+            that may not fit in memory.
         force: True if an existing file may be replaced.
-        remedy: Advice that the error contains if the disk is full.
+        remedy: Advice added to the error message if the disk is full.
         mode: Permissions of a new file, before the umask.
 
     Raises:
         UsageError: The file exists, is a symbolic link, or cannot be created.
-        LogRefused: The disk refused the data.
+        LogRefused: The data could not be written, for example because the disk is full.
     """
     parts = [data] if isinstance(data, bytes | str) else data
     refuse_link(path)
@@ -485,30 +495,31 @@ def write_whole(
 
 
 def _write_parts(stream: BinaryIO, parts: Iterable[bytes | str]) -> None:
-    """Writes the parts of a file one after the other, and encodes text as UTF-8."""
+    """Writes the parts of a file in sequence, encoding text as UTF-8."""
     for part in parts:
         stream.write(part.encode() if isinstance(part, str) else part)
 
 
 @contextmanager
 def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Iterator[Path]:
-    """Lets the caller write an output at a temporary path, as a context manager.
+    """Context manager that lets the caller write an output at a temporary path.
 
-    If the block succeeds, the output gets its final name. If the block raises an exception, the
-    unfinished output is deleted, and an earlier output stays.
+    If the block succeeds, the output is renamed to its final name. If the block raises an
+    exception, the unfinished output is deleted, and an earlier output is kept.
 
     Args:
         path: The output, which is a file or a folder.
         force: True if an earlier output of the same kind may be replaced.
-        manifest: Name of a file that marks an earlier output folder, see `refuse_existing`. If
-            it is set, the temporary path is a folder. None if the output is a file.
+        manifest: Name of a file that identifies an earlier output folder (see
+            `refuse_existing`). If given, the temporary path is a folder. None if the output is
+            a file.
 
     Yields:
         The temporary path.
 
     Raises:
-        UsageError: The name is taken, or the path is not writable.
-        LogRefused: The disk refused the data.
+        UsageError: The path is already in use, or is not writable.
+        LogRefused: The data could not be written, for example because the disk is full.
     """
     refuse_existing(path, force=force, manifest=manifest)
     remedy = "no partial file was left. Free some space, or use another disk"
@@ -539,18 +550,18 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
-    """Converts a system error from writing a file into an error that tells users what to do.
+    """Converts a system error raised while writing a file to an error with a remedy.
 
-    A full disk needs a different remedy from a wrong path. Therefore the two cases have
-    different errors. The caller raises the result.
+    A full disk and a wrong path require different remedies, so they are reported by different
+    error classes. The caller raises the result.
 
     Args:
         path: The file.
-        error: The error of the system.
-        remedy: Advice that is added if the disk refused the data.
+        error: The system error.
+        remedy: Advice that is added if the disk rejected the data.
 
     Returns:
-        LogRefused if the disk refused the data, for example because it is full. Otherwise
+        LogRefused if the disk rejected the data, for example because it is full. Otherwise
         UsageError.
     """
     text = f"{path} cannot be written: {error.strerror or error}"

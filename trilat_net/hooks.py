@@ -1,16 +1,17 @@
-"""Lets a package call a function of a package that it must not import.
+"""Lets a lower-level package call functions of a package that it must not import.
 
-A package may import only packages of lower layers. Nevertheless `Log.plot`, a method of a low
-layer, needs the drawing functions of the higher package `presentation`. Therefore
-`presentation` registers its function here under the name of its purpose, and the method looks
-up this name with `find_hook`. Such a registered function is called a hook.
+A package may import only packages of lower layers. Some methods of a low layer nevertheless
+need functions of a higher one: `Log.plot`, for example, needs the drawing functions of the
+package `presentation`. That package registers its function here under a name that describes its
+purpose, and the method looks up the name with `find_hook`. Functions registered in this way are
+called hooks.
 
-`import_on_use` serves the `__init__.py` of packages: it imports a module only when somebody
-uses one of its names, so that programs start fast.
+`import_on_use` is for the `__init__.py` of packages. It imports a module only when one of its
+names is first used, which makes programs start faster.
 
 Invariant:
-    - Registering imports nothing. The module of a function is imported when the function is
-      first looked up.
+    - Registering a function imports nothing. Its module is imported when the function is first
+      looked up.
     - `trilat_net/__init__.py` imports every package that registers functions. All hooks are
       therefore known before any other module of the program is imported.
 """
@@ -21,20 +22,20 @@ from importlib import import_module
 from typing import Any
 
 _loaders: dict[str, Callable[[], Any]] = {}
-"""For each hook, a function that imports the registered function and returns it."""
+"""Mapping from hook name to a function that imports and returns the registered function."""
 
 
 def register_hooks(package: str, functions: Mapping[str, str]) -> None:
-    """Registers functions of an upper package by name, so that lower packages can call them.
+    """Registers functions of a higher-level package by name for use in lower-level packages.
 
-    A lower package, such as `log`, must not import an upper package, such as the ROS package.
-    It looks up the registered function instead (`find_hook`). The modules are imported only
-    then.
+    A lower-level package, such as `log`, must not import a higher-level package, such as the
+    ROS package. Instead, it looks up the registered function with `find_hook`, and the module
+    is imported only at that time.
 
     Args:
         package: Name of the package, `__name__` in its `__init__.py`.
-        functions: For each hook, the function as "module:function". The modules belong to
-            `package`.
+        functions: Mapping from hook name to the function, as "module:function". The modules
+            belong to `package`.
     """
     for hook, function in functions.items():
         module, _, name = function.partition(":")
@@ -42,36 +43,36 @@ def register_hooks(package: str, functions: Mapping[str, str]) -> None:
 
 
 def find_hook(hook: str) -> Any:
-    """Returns the function that an upper package has registered under a name.
+    """Returns the function that a higher-level package registered under a name.
 
-    A lower package can thus call a function that it must not import.
+    This lets a lower-level package call it without importing that package.
 
     Args:
-        hook: Name of the hook, as in "plot a log".
+        hook: Name of the hook, for example "plot a log".
 
     Raises:
-        ModuleNotFoundError: A library that the function needs is not installed.
+        ModuleNotFoundError: A library required by the function is not installed.
         KeyError: No package has registered a function under this name.
     """
     return _loaders[hook]()
 
 
 def list_hooks() -> list[str]:
-    """Returns the names under which upper packages have registered functions, for the tests."""
+    """Returns the names of all registered hooks, for the tests."""
     return list(_loaders)
 
 
 def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Returns the `__getattr__` of a package, which imports a module when it is first needed.
+    """Returns a `__getattr__` for a package, which imports modules when first needed.
 
-    Importing a name from the package therefore imports only the module that defines the name.
-    If the package imported all of its modules, programs that need few of them would start late,
-    and two packages that need each other's modules could not be imported.
+    Importing a name from the package then imports only the module that defines the name. If the
+    package imported all of its modules, programs that need only a few of them would start
+    slowly, and two packages that need each other's modules could not be imported.
 
     Args:
         package: Name of the package, `__name__` in its `__init__.py`.
-        modules: For each module, the names of the interface that it defines, separated by
-            spaces. If a name equals the name of the module, it stands for the module itself.
+        modules: Mapping from module to the public names that it defines, separated by spaces. A
+            name equal to the module's name denotes the module itself.
     """
     module_of_name = {}
     for module_name, names in modules.items():
@@ -90,8 +91,8 @@ def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], A
 
 
 def _import_function(module: str, name: str) -> Any:
-    """Imports a function that an upper package has registered as a hook.
+    """Imports a function that a higher-level package has registered as a hook.
 
-    The import happens when a lower package uses the hook for the first time.
+    The import takes place when a lower-level package first uses the hook.
     """
     return getattr(import_module(module), name)

@@ -1,8 +1,8 @@
 """Lists the commands and functions of the optional packages, such as trilat-studies.
 
-If a user calls `trilat sweep` and trilat-studies is missing, this program must know the command
-to say what to install. The lists also give the order of the commands in the help. The packages
-register the commands themselves (`entry_points`).
+If a user calls `trilat sweep` and trilat-studies is not installed, the program needs to
+recognise the command to tell the user what to install. The lists also define the order of the
+commands in the help. The packages register the commands themselves (see `entry_points`).
 """
 
 PACKAGE_COMMANDS = {
@@ -38,7 +38,7 @@ PACKAGE_COMMANDS = {
     },
     "trilat-ros2": {"ros2": "Connects a session to ROS 2."},
 }
-"""The commands of each package, with the first sentence of their help."""
+"""Commands of each package, with the first sentence of their help."""
 PACKAGE_FUNCTIONS = {
     "trilat-people": (
         "HaplyInverse3 SpaceMouse analyse_experiment check_experiment compute_experiment_power "
@@ -46,6 +46,6 @@ PACKAGE_FUNCTIONS = {
     ),
     "trilat-studies": ("bench check compare make_env margin sweep trials tune tune_arm"),
 }
-"""The names in `trilat_net` that each package defines, separated by spaces."""
+"""Names that each package defines in `trilat_net`, separated by spaces."""
 PACKAGE_HOOKS = {"trilat-people": "device-hand"}
-"""The functions of each package that methods of this program call, separated by spaces."""
+"""Functions of each package that are called by methods of this program, separated by spaces."""

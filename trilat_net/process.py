@@ -1,12 +1,13 @@
-"""Keeps the process of a control loop on time: its priority, and Python's garbage collector.
+"""Process priority and garbage collection settings that keep a control loop on time.
 
-A control loop must not wait for other programs or for Python's garbage collector.
-`request_real_time_scheduling` and `raise_priority` address the first, `disable_gc` and
-`freeze_gc` the second. `pause_gc` speeds up code that creates many objects.
+A control loop must not wait for other programs (`request_real_time_scheduling`,
+`raise_priority`) or for Python's garbage collector (`disable_gc`, `freeze_gc`). `pause_gc`
+speeds up code that creates many objects.
 
 Invariant:
     - `pause_gc` is used only around code that creates many objects without reference cycles,
-      such as records and lists of numbers. Collecting them would cost time and free nothing.
+      such as records and lists of numbers. Garbage collection would take time there and free
+      nothing.
 """
 
 import gc
@@ -18,16 +19,17 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 FIFO_PRIORITY = 50
-"""Priority of the thread of a control loop with real-time scheduling (SCHED_FIFO)."""
+"""Real-time priority (SCHED_FIFO) of the thread that runs a control loop."""
 LOOP_NICE = -10
 """Nice value of a control loop if real-time scheduling is not permitted."""
 
 
 @contextmanager
 def pause_gc() -> Iterator[None]:
-    """Pauses the garbage collector of Python inside the `with` block.
+    """Pauses Python's garbage collector inside the `with` block.
 
-    Code that creates many objects then runs faster, because the collector does not search them.
+    Code that creates many objects runs faster this way, because the collector does not traverse
+    them.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -39,9 +41,9 @@ def pause_gc() -> Iterator[None]:
 
 
 def freeze_gc() -> None:
-    """Speeds up later garbage collections by exempting all objects that exist now.
+    """Speeds up later garbage collections by exempting all existing objects.
 
-    One collection runs first. Without this function, each full collection traverses all objects
+    A collection is run first. Without this function, each full collection traverses all objects
     of the imported modules, which takes a quarter of a second.
     """
     gc.collect()
@@ -49,10 +51,10 @@ def freeze_gc() -> None:
 
 
 def disable_gc() -> None:
-    """Turns off the garbage collector for the rest of a process whose loop must not pause.
+    """Disables the garbage collector permanently in a process whose loop must not pause.
 
-    One collection runs first. Afterwards, unused objects stay in memory only if they are in
-    reference cycles.
+    A collection is run first. After that, unused objects remain in memory only if they are part
+    of reference cycles.
     """
     freeze_gc()
     gc.disable()
@@ -61,16 +63,16 @@ def disable_gc() -> None:
 def request_real_time_scheduling() -> str:
     """Requests real-time scheduling for this process, or at least a better nice value.
 
-    Call it in a program that must exchange messages with a site in every period, such as the
-    driver of an arm or of a haptic device. On a busy machine its loop then still runs on time.
-    A loop that never sleeps would block a processor.
+    Intended for programs that must exchange messages with a site in every tick, such as the
+    driver of an arm or of a haptic device. Their loops then run on time even on a busy machine.
+    Note that a loop that never sleeps would block a processor.
 
     >>> tn.request_real_time_scheduling()  # doctest: +SKIP
     'SCHED_FIFO 50'
 
-    All threads of the process get real-time scheduling (SCHED_FIFO), and the calling thread has
-    the highest priority. The other threads are included because one of them may hold the
-    interpreter lock, for which the calling thread would have to wait.
+    All threads of the process get real-time scheduling (SCHED_FIFO), and the calling thread
+    gets the highest priority. The other threads are included because the calling thread may
+    have to wait for the interpreter lock held by one of them.
 
     Returns:
         Description of the scheduling that was obtained, for example "SCHED_FIFO 50".
@@ -96,10 +98,10 @@ def request_real_time_scheduling() -> str:
 def _change_threads(change: Callable[[int], None]) -> None:
     """Applies a change, such as a higher priority, to all threads of this process.
 
-    The calling thread comes first.
+    The calling thread is changed first.
 
     Args:
-        change: Function that changes the thread with a given number. 0 is the calling thread.
+        change: Function that changes the thread with a given ID. 0 denotes the calling thread.
     """
     change(0)
     threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
@@ -113,17 +115,17 @@ def _change_threads(change: Callable[[int], None]) -> None:
 def raise_priority(nice: int) -> bool:
     """Raises the priority of all threads of this process except the main thread, if permitted.
 
-    On a busy machine, these threads are then delayed less by other programs. The main thread is
-    excluded because the processes that it starts would inherit the priority. If it is the
-    calling thread, its priority is raised too. Only Linux has a priority (nice value) for each
-    thread. On other systems, and without the privilege, nothing changes.
+    On a busy machine, other programs then delay these threads less. The main thread is
+    excluded, unless it is the calling thread, because child processes would inherit its
+    priority. Only Linux has a nice value per thread. On other systems, and without the required
+    privilege, nothing changes.
 
     Args:
-        nice: The nice value. Values below 0 are above the normal priority, and -20 is the
-            highest.
+        nice: The nice value. Values below 0 mean a higher priority than normal, and -20 is the
+            highest priority.
 
     Returns:
-        True if the calling thread got the priority.
+        True if the calling thread has the requested priority.
     """
     threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
     if not (sys.platform.startswith("linux") and threads_folder.is_dir()):
@@ -144,13 +146,13 @@ def raise_priority(nice: int) -> bool:
 
 
 def _raise_session_priority(nice: int) -> None:
-    """Raises the priority of the operating system's session that this process leads, if any.
+    """Raises the priority of the operating system session that this process leads, if any.
 
-    A session is a group of processes (`setsid`). Linux may share the processors among sessions
-    first, and only then among the threads of a session (`man 7 sched`, "The autogroup
-    feature"). The nice value of a thread then has no effect outside its session. If another
-    process leads the session, for example a shell, nothing changes, because its other processes
-    would be raised too.
+    A session is a group of processes (`setsid`). Linux may distribute processor time first
+    among sessions, and only then among the threads of each session (`man 7 sched`, "The
+    autogroup feature"). In this case, the nice value of a thread has no effect outside its
+    session. If another process, for example a shell, leads the session, nothing is changed,
+    because this would also affect its other processes.
     """
     if os.getsid(0) == os.getpid():
         with suppress(OSError):  # not permitted, or the system has no such groups

@@ -1,9 +1,8 @@
-"""Defines how a log states what changed during a run, for example the delay of a network link.
+"""Format in which a log stores changes during a run, for example of a link delay.
 
-Each site, the control process of one arm, stores a record in each control period. The record
-contains the JSON text of every change that the site applied in the period. Programs that only
-forward or store records can read these texts with the types of this module, without the
-scenario (the description of the experiment).
+Each site stores one record per tick, which contains every change applied in that tick as a JSON
+string. The types of this module allow programs that only forward or store records to parse
+these strings without the scenario.
 """
 
 from collections.abc import Sequence
@@ -25,9 +24,9 @@ SiteOrder = Literal[
     "released",
     "held",
 ]
-"""Commands that change the mode of a site. The empty text means that there is no command.
+"""Commands that change the mode of a site. An empty string means that there is no command.
 
-Users send "stop", "enable" and "reset". The site itself causes the others, for example
+Users send "stop", "enable" and "reset". The others are issued by the site itself, for example
 "arm_lost" if no measurement has arrived from its robot.
 """
 
@@ -35,22 +34,21 @@ Users send "stop", "enable" and "reset". The site itself causes the others, for 
 class RecordedChange(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
 ):
-    """Change during a run as recorded in a log, for example a new network delay.
+    """A change during a run as recorded in a log, for example a new network delay.
 
-    It changes a network link, the weights with which an arm follows the others, or gives a
-    command to one arm's process. Exactly one of `link`, `dominance` and `site` is not empty.
-    The values are not checked; `change.Change` is the checked form.
+    The change applies to a link, to the dominance factors of a site, or is a command for a
+    site. Exactly one of `link`, `dominance` and `site` is not empty. The values are not
+    validated; `change.Change` is the validated form.
 
     Attributes:
-        at_s: Time at which the change takes effect, in s after the epoch, the common start
-            time. A link changes for samples that are sent at this time or later.
+        at_s: Time at which the change takes effect, in s since the start of the session. A link
+            changes for samples sent at this time or later.
         link: Name of the link that changes, for example "m1->s".
-        dominance: Name of the site whose dominance factors change. A dominance factor is the
-            weight with which the site follows a peer.
+        dominance: Name of the site whose dominance factors change.
         to: State after the change: all keys of the link, or the factors of all peers.
         ramp_s: Duration of the linear transition to the new factors, in s.
         site: Name of the site that receives a command.
-        order: The command, see `core.step.ticks.LifeOrder`.
+        order: The command. See `core.step.ticks.LifeOrder`.
         ticks: For the command "overrun": number of ticks that the site missed.
     """
 
@@ -65,13 +63,13 @@ class RecordedChange(
 
 
 def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns how many control periods (ticks) an arm missed just before a record.
+    """Returns how many ticks an arm missed just before a record.
 
-    An arm misses ticks if its control loop is too late. A record lists the changes of its tick,
-    among them those that report missed ticks.
+    Ticks are missed if the control loop is too late. A record contains the changes applied in
+    its tick, including those that report missed ticks.
 
     Args:
-        texts: JSON texts of the changes in the record. Texts that cannot be read are ignored.
+        texts: Changes in the record, as JSON strings. Invalid strings are ignored.
     """
     skipped = 0
     for text in texts:

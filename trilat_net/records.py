@@ -1,12 +1,11 @@
-"""Defines the record of a control period, and the state that an arm sends to the others.
+"""Defines the record of one tick, and the sample that an arm sends to the others.
 
-Each arm is controlled by a process called a site, in periods called ticks. The kernel computes
-the record of a tick, the network sends it, and the log stores it. All of them use the types of
-this module. Programs that only send or store records therefore need neither the kernel nor its
-compiler.
+The kernel computes the record of a tick, the network sends it, and the log stores it. All of
+them use the types of this module, so programs that only send or store records need neither the
+kernel nor its compiler.
 
 Invariant:
-    - This module imports nothing of the program.
+    - This module imports nothing from the program.
 """
 
 from collections.abc import Sequence
@@ -21,21 +20,20 @@ PARAMETERS = 5
 MAX_JOINTS = 12
 """Largest number of joints of an arm."""
 MAX_LAW_MEMORY = 1024
-"""Largest number of values in a law's memory, which each record contains."""
+"""Largest number of values in a law's memory, which is part of each record."""
 
 
 class Mode(IntEnum):
-    """Mode of a site, the process that runs one arm, in a period of its control loop.
+    """Mode of a site in one tick.
 
-    RUN: the arm follows the other arms. If no samples (states) come from one of them, the mode
-    becomes HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When
-    samples come again, it becomes RETURN (the arm moves smoothly back to the others), and then
-    RUN. DIVERGED: a joint was too fast, or a number was not finite. This mode is final.
+    RUN: the arm follows the other arms. If no samples arrive from one of them, the mode becomes
+    HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When samples
+    arrive again, it becomes RETURN (the arm moves smoothly back to the others), and then RUN.
+    DIVERGED: a joint was too fast, or a value was not finite. This mode is final.
 
-    Under the rule `glide`, explained in `core.life.session_life`, there are further modes, and
-    the arm is at rest in all of them. WAITING: samples have not arrived from all other arms
-    yet. FAULT: a limit was exceeded; this mode replaces DIVERGED. STOPPED: the arm was stopped
-    by a command.
+    The rule `glide` (see `core.life.session_life`) has additional modes, in all of which the
+    arm is at rest. WAITING: samples have not yet arrived from all other arms. FAULT: a limit
+    was exceeded; this mode replaces DIVERGED. STOPPED: the arm was stopped by a command.
     """
 
     RUN = 1
@@ -49,20 +47,19 @@ class Mode(IntEnum):
 
 
 class Arrival(NamedTuple):
-    """Sample that arrived at a site: the state that another arm sent at one moment.
+    """A sample that arrived at a site: the state that a peer sent in one tick.
 
-    A site is a process that runs one arm, and its peers are the other sites. Each peer sends a
-    sample over the network in each period of its control loop.
+    Each peer sends one sample per tick.
 
     Attributes:
         peer: Index of the peer.
-        tick: Number of the peer's control period in which it sent the sample.
+        tick: Tick of the peer in which the sample was sent.
         q: Joint angles of the peer, rad.
         qd: Joint velocities of the peer, rad/s.
-        latency_us: Measured latency of the network, us. It is only recorded, and has no effect.
+        latency_us: Measured network latency, us. Recorded for information only.
         tau_x: External torque of the peer, N m, for control laws that reflect force. The torque
             ON its arm is the negative.
-        ch: Further values that the control law of the peer sent, see `core.plug.law_channel`.
+        ch: Additional values sent by the control law of the peer. See `core.plug.law_channel`.
     """
 
     peer: int
@@ -75,43 +72,44 @@ class Arrival(NamedTuple):
 
 
 class TickRecord(NamedTuple):
-    """State at the start of a control period (tick), and the results computed from it.
+    """State of a site at the start of a tick, and the results computed from it.
 
-    The state at the end of the period is not included: it belongs to the next record.
+    The state at the end of the tick is part of the next record.
 
     Attributes:
         tick: Number k of the tick.
-        t_ns: Nominal time, ns since the epoch.
+        t_ns: Nominal time, ns since the start of the session.
         mode: The site's mode.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         q_des: Reference q_id, Eq. (6), rad.
         qd_des: Derivative of q_des, rad/s.
         tau: Control torque, Eq. (13), N m.
-        tau_x: Exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
+        tau_x: External torque with the sign of Eq. (8), N m; the torque ON the arm is its
             negative.
-        theta_hat: Estimate of the parameters.
-        used: Tick of the sample in use, per peer in scenario order; -1 before the first.
-        rx_crc: CRC-32 of the arrivals of this tick, as the step received them. If an input in
-            the log was modified, this checksum differs at the tick of the input. Each arrival
-            is little-endian (peer i64, tick i64, q f64s, qd f64s), followed by its tau_x if the
-            law reflects force.
-        cmd: Texts of the changes that this tick applied.
-        mem: State of the site that no other field contains. It is empty in RUN and DIVERGED. In
-            other modes, it is the held pose, rad, and the time at which the return began, ns
-            since the epoch, or 0 before the return. For a site with a user's law, it contains
-            these values in every mode, followed by the memory of the law. Under the rule
-            `glide`, it is the state of `core.life.session_life` in every mode, see
-            `Layout.count_life_memory`.
-        x: Pose of the end effector that the sites share in task space: position, m, and
-            orientation. Empty in joint space.
+        theta_hat: Parameter estimate.
+        used: Tick of the sample in use from each peer, in scenario order; -1 before the first
+            sample.
+        rx_crc: CRC-32 of the arrivals of this tick, as received by the step. A modified input
+            in the log is detected by a mismatch of this checksum in the tick of the input. Each
+            arrival is encoded in little-endian order (peer i64, tick i64, q f64s, qd f64s),
+            followed by its tau_x if the law reflects force.
+        cmd: Changes applied in this tick, as JSON strings.
+        mem: State of the site that no other field contains. Empty in RUN and DIVERGED. In other
+            modes, the held pose, rad, and the time at which the return began, ns since the
+            start of the session, or 0 before the return. For a site with a user's law, these
+            values are present in every mode, followed by the memory of the law. Under the rule
+            `glide`, the state of `core.life.session_life` in every mode (see
+            `Layout.count_life_memory`).
+        x: Pose of the end effector that is shared in task space: position, m, and orientation.
+            Empty in joint space.
         xd: Derivative of x, m/s and rad/s.
         wrench: tau_x expressed at the end effector, N and N m.
-        ch: The values that the site's law sends, see `core.plug.law_channel`.
-        hand: The action in this tick of a live hand, a person or program that moves the arm
-            during the run, see `core.life.live_hand`. Empty without a live hand.
-        bodies: Poses of the other bodies in the scene, seven values each: x, y, z in the arm's
-            base frame, m, and the unit quaternion w, x, y, z. Empty without such bodies.
+        ch: Values sent by the site's law. See `core.plug.law_channel`.
+        hand: Action of a live hand (a person or program that moves the arm during the run) in
+            this tick. See `core.life.live_hand`. Empty if there is no live hand.
+        bodies: Poses of other bodies in the scene, seven values each: x, y, z in the arm's base
+            frame, m, and the unit quaternion w, x, y, z. Empty if there are none.
     """
 
     tick: int
@@ -136,13 +134,12 @@ class TickRecord(NamedTuple):
     bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns what an arm sends to the other arms in a control period.
+        """Returns the motion and external torque that an arm sends to the others in one tick.
 
-        In task space, where arms follow each other's end effectors, it is the motion of the end
-        effector, otherwise that of the joints.
+        The values describe the end effector in task space, and the joints otherwise.
 
         Returns:
-            The position, the velocity and the exogenous torque, each with one number per
+            The position, the velocity and the external torque, each with one entry per
             coordinate.
         """
         if self.x:
@@ -151,20 +148,20 @@ class TickRecord(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Lengths of the vectors that belong to an arm and its control law, such as 2 joint angles.
+    """Lengths of the vectors of an arm and its control law, for example 2 joint angles.
 
-    All arrays and log records of an arm are laid out by these lengths.
+    These lengths determine the layout of all arrays and log records of the arm.
 
     Attributes:
         joints: Number of joints of the arm.
-        shared: Number of coordinates that the arms send each other.
+        shared: Number of coordinates that the arms send to each other.
         parameters: Number of dynamic parameters of the arm.
         chain: True if the arm is a chain of joints. False for the planar two-link arm.
         task: True if the coordinates are the pose of the end effector. False if they are joint
             angles.
-        sent: Number of values that the control law sends to other arms in each period.
-        hand: Number of values that describe the person or program who moves the arm during the
-            run, see `core.life.live_hand`. 0 without a live hand.
+        sent: Number of values that the control law sends to other arms in each tick.
+        hand: Number of values that describe a live hand, see `core.life.live_hand`. 0 if there
+            is no live hand.
         bodies: Number of values in the poses of other bodies in the scene, see
             `TickRecord.bodies`.
     """
@@ -181,15 +178,14 @@ class Layout(NamedTuple):
     def axes(self) -> dict[str, int]:
         """Returns the sizes of the named dimensions of state arrays, for example "joints": 2.
 
-        The names are "joints", "shared" and "parameters", see `core.step.row_fields`.
+        The names are "joints", "shared" and "parameters" (see `core.step.row_fields`).
         """
         return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
 
     def lengths(self) -> dict[str, int]:
-        """Returns the lengths of the vectors of a record by name, in their order.
+        """Returns the lengths of the vectors of a record, keyed by name, in record order.
 
-        A record is the result of one control period. Vectors that the arm does not have are
-        left out.
+        Vectors that the arm does not have are omitted.
         """
         lengths = {
             "q": self.joints,
@@ -207,14 +203,12 @@ class Layout(NamedTuple):
         return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Returns which columns of a record contain each vector, for example "q": slice(0, 2).
+        """Returns the columns of each vector in a record, for example "q": slice(0, 2).
 
-        A record is the row of floating-point numbers that an arm's process computes in one
-        period of its control loop.
+        A record is the row of floating-point numbers computed by a site in one tick.
 
         Returns:
-            A slice for each vector, by name. Vectors that are inputs of the period are left
-            out.
+            A mapping from vector name to slice, excluding vectors that are inputs of the tick.
         """
         columns = {}
         first = 0
@@ -226,20 +220,20 @@ class Layout(NamedTuple):
         return columns
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the recorded values from which an arm at rest can continue a run.
+        """Counts the recorded values needed to resume a run with the arm at rest.
 
-        Under the rule `glide`, an arm comes to rest while another arm is silent, see
-        `core.life.session_life`. The state of this rule is at the start of the field `mem` of
-        the log:
+        Under the rule `glide`, an arm comes to rest while another arm is silent (see
+        `core.life.session_life`). The state of this rule is stored at the start of the field
+        `mem`:
 
-        - the values that every such arm stores, for example the last time of a sample from each
-          other arm,
+        - values stored for every arm, for example the time of the last sample from each other
+          arm,
         - in task space, the reference that brings the joints to rest (`rest_columns`),
-        - if the arm may continue without a lost arm, one value per other arm: whether it is
-          lost.
+        - if the arm may continue without a lost arm, one flag per other arm that states whether
+          it is lost.
 
         Args:
-            peers: Number of the other sites from which this site receives data.
+            peers: Number of sites from which this site receives data.
             degrades: True if the site continues without a lost site.
         """
         end_of_reference: int = self.rest_columns(peers).stop
@@ -247,21 +241,20 @@ class Layout(NamedTuple):
         return end_of_reference + lost_peer_values
 
     def rest_columns(self, peers: int) -> slice:
-        """Returns the part of `mem` with the reference that brings the joints to rest.
+        """Returns the slice of `mem` that holds the reference for bringing the joints to rest.
 
-        The field `mem` of a record contains values from which a run can be continued. For a
-        site (the process that runs one arm) with n joints, m coordinates that the sites share,
-        and P peers (the other sites), it starts with the values that `Site` stores under the
-        rule `glide`:
+        The field `mem` of a record contains the values needed to resume a run. For a site with
+        n joints, m shared coordinates and P peers, it starts with the values that `Site` stores
+        under the rule `glide`:
 
             q_held (m), return_from_ns (1), qd_held (m), reason (1), used_ns (P), tau_held (n),
             q_rest (n), qd_rest (n)                                       only in task space
 
-        `q_rest` and `qd_rest` are the positions and velocities of the reference, for each
-        joint. In joint space, `q_held` and `qd_held` contain them while the arm rests.
+        `q_rest` and `qd_rest` are the position and velocity of the reference for each joint. In
+        joint space, they are stored in `q_held` and `qd_held` while the arm rests.
 
         Args:
-            peers: Number P of the other sites from which this site receives data.
+            peers: Number P of sites from which this site receives data.
 
         Returns:
             The slice of `q_rest` and `qd_rest`. Empty in joint space.
@@ -273,13 +266,13 @@ class Layout(NamedTuple):
         return slice(first, first + length)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the silent arms without which this arm continues.
+        """Returns the names of the lost arms without which this arm continues.
 
-        The names are derived from a record of this arm's log.
+        The names are decoded from a record in this arm's log.
 
         Args:
-            mem: Field `mem` of the record, the numbers that the site keeps from tick to tick.
-            peers: Names of the other arms (peers) that this arm follows, in scenario order.
+            mem: Field `mem` of the record, the state that the site keeps between ticks.
+            peers: Names of the peers that this arm follows, in scenario order.
         """
         end = self.count_life_memory(len(peers), degrades=True)
         # One number per peer: 0 if the peer is present.
@@ -289,9 +282,9 @@ class Layout(NamedTuple):
 
     @property
     def floats(self) -> int:
-        """Number of floats that an arm's process computes in one period of the control loop.
+        """Number of floats that a site computes in one tick.
 
-        They form a record of the log. Floats that are inputs of the period are not counted.
+        These floats form a record of the log. Inputs of the tick are not counted.
         """
         shared_vectors = 5 if self.task else 2
         return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent

@@ -1,13 +1,12 @@
-"""Defines what commands and functions return: objects that become text, a table or JSON.
+"""Results of commands and functions, which can be converted to text, a table or JSON.
 
-The commands in the terminal and the functions of the Python interface return the same objects.
-The terminal prints `summary()`, and programs read the values or call `to_dict()`.
+Terminal commands and functions of the Python interface produce the same objects. The terminal
+prints `summary()`, and programs read the values or call `to_dict()`.
 
 Invariant:
-    - A result contains only values. Modules that compute therefore do not depend on modules
-      that format: the package `presentation` registers the functions that compose texts in
-      `hooks`.
-    - JSON contains no NaN and no infinity. An unknown quantity is null.
+    - A result contains only values. Computing modules therefore do not depend on formatting
+      modules: the package `presentation` registers the functions that compose texts in `hooks`.
+    - JSON output contains no NaN or infinity. An unknown quantity is null.
 """
 
 import math
@@ -32,32 +31,33 @@ class Result:
     """
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result as plain values, which can be written as JSON.
+        """Converts the result to plain values that can be written as JSON.
 
-        The keys are those that the command prints with --json.
+        The keys are those printed by the command with --json.
         """
         return dict(vars(self))
 
     def to_rows(self) -> Sequence[Mapping[str, Any]]:
-        """Returns the result as rows of a table, for `to_frame`.
+        """Returns the rows of the result's table, each a mapping from column name to value.
 
-        By default, there is one row with all plain values of the result.
+        Used by `to_frame`. By default, there is a single row with all plain values of the
+        result.
         """
         values = self.to_dict().items()
         row = {key: value for key, value in values if not isinstance(value, dict | list)}
         return [row]
 
     def summary(self) -> str:
-        """Returns the text about the result that the command prints in the terminal.
+        """Returns the text that the command prints in the terminal.
 
-        A command that has the option --all prints the whole text only with this option.
+        A command with the option --all prints the complete text only if this option is given.
         """
         return str(find_hook("summarize a result")(self))
 
     def to_frame(self) -> "pandas.DataFrame":
-        """Returns the result as a pandas data frame.
+        """Converts the result to a pandas data frame.
 
-        It has the rows of `to_rows`, and one column per key of these rows.
+        The rows are those of `to_rows`, with one column per key.
 
         Raises:
             UsageError: pandas is not installed.
@@ -66,9 +66,10 @@ class Result:
         return pandas.DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
-        """Returns the result in one line: the first line of its summary that is not blank.
+        """Returns the result in one line: the first non-blank line of its summary.
 
-        Lists of several results show this line. A result with an empty summary gives "nothing".
+        This line is shown in lists of several results. Returns "nothing" if the summary is
+        empty.
         """
         for line in self.summary().splitlines():
             if line.strip():
@@ -88,12 +89,9 @@ JsonObject = dict[str, Any]
 
 
 def finite_or_none(value: float) -> float | None:
-    """Returns a number, or None in place of NaN or infinity, which JSON cannot express.
+    """Returns a number, or None if it is NaN or infinite, which JSON cannot represent.
 
     Args:
         value: The number.
-
-    Returns:
-        The number. None if it is NaN or infinite, which JSON cannot express.
     """
     return value if math.isfinite(value) else None

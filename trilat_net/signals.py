@@ -1,11 +1,11 @@
-"""Lets loops end in an orderly way after Ctrl-C or another signal that requests the end.
+"""Lets loops shut down cleanly after Ctrl-C or another termination signal.
 
 By default, Python raises an exception at an arbitrary line. A control loop or a recorder must
-not end at such a line, but at the end of a step.
+stop at the end of a step instead.
 
 Invariant:
-    - Ctrl-C or another ending signal does not end the program by itself. A loop polls for the
-      signal, and then ends in an orderly way.
+    - Ctrl-C or another termination signal does not end the program by itself. A loop polls for
+      the signal and then shuts down cleanly.
 """
 
 import os
@@ -21,28 +21,28 @@ from typing import Any
 _HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, _HANG_UP)
 ENDING_SIGNALS = tuple(number for number in _SIGNALS if number is not None)
-"""Signals that request the end of the program, such as the signal of Ctrl-C."""
+"""Signals that request the end of the program, such as SIGINT (Ctrl-C)."""
 _SAME_REQUEST_S = 0.2
-"""Signals within this time, in s, count as one request.
+"""Time, in s, within which signals count as one request.
 
 A terminal and a parent process may both deliver the same signal.
 """
 
 
 class Interrupt:
-    """Records signals that request the end of the program, as a context manager.
+    """Context manager that records signals that request the end of the program.
 
-    The first signal requests an orderly end, which may take seconds. A second signal requests
-    the end at once (`is_repeated`). A process that ignores the closing of its terminal, for
+    The first signal requests a clean shutdown, which may take seconds. A second signal requests
+    an immediate end (`is_repeated`). A process that ignores the closing of its terminal, for
     example one started by `nohup`, continues to ignore it.
 
     Args:
-        compiles: True if a signal may end the process at once during a compilation. This is
-            allowed if the process has nothing to finish then.
+        compiles: True if a signal may end the process immediately during a compilation, which
+            is allowed if the process has nothing to finish at that time.
 
     Attributes:
         number: Number of the first signal. 0 if no signal has arrived.
-        compiles: The value of the argument.
+        compiles: Value of the argument `compiles`.
         raises: True within a `with` block of `raising`, where a signal raises
             KeyboardInterrupt.
     """
@@ -76,17 +76,17 @@ class Interrupt:
             outer.number = outer.number or self.number
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
-        """Records a signal that requests the end of the program, such as the signal of Ctrl-C.
+        """Records a signal that requests the end of the program, such as SIGINT (Ctrl-C).
 
-        The first signal requests an orderly end. A second Ctrl-C requests the end at once, for
-        a user who does not want to wait. Two signals in quick succession count as one request,
+        The first signal requests a clean shutdown. A second Ctrl-C requests an immediate end,
+        for users who do not want to wait. Two signals in quick succession count as one request,
         because a terminal and a parent process may both deliver the same signal.
 
         Args:
             number: Number of the signal.
 
         Raises:
-            KeyboardInterrupt: The signal has arrived in a `with` block of `raising`.
+            KeyboardInterrupt: The signal arrived in a `with` block of `raising`.
         """
         self.number = self.number or number
         # When a terminal closes, the terminal and its shell each send SIGHUP. The second one
@@ -102,11 +102,11 @@ class Interrupt:
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Lets a signal raise KeyboardInterrupt in a `with` block, to interrupt long work.
+        """Context manager in which a signal raises KeyboardInterrupt, to interrupt long work.
 
-        It is meant for work that does not regularly check whether a signal has arrived. Python
-        discards an exception that is raised within a `__del__` method. If this happens, the
-        exception is raised again at the end of the block.
+        Intended for work that does not check for signals regularly. Python discards exceptions
+        raised within a `__del__` method. If this happens, the exception is raised again at the
+        end of the block.
         """
         self.raises = True
         try:
@@ -129,23 +129,23 @@ class Interrupt:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a process that was ended by the first signal, according to shell rules.
+        """Exit code of a process ended by the first signal, following shell conventions.
 
-        It is 128 plus the number of the signal.
+        The code is 128 plus the number of the signal.
         """
         return 128 + self.number
 
 
 def end_process_at_signals() -> Callable[[], None]:
-    """Makes signals end this process at once, if the current `Interrupt` allows it.
+    """Makes signals end this process immediately, if the current `Interrupt` allows it.
 
-    Python handles a signal only between two of its instructions. A single call of the compiler
-    may take minutes, during which Ctrl-C would have no effect. Therefore the default action of
-    the operating system is restored, which ends the process. The first process of a container
-    (PID 1) has no default action, so a thread ends the process there.
+    Python handles signals only between bytecode instructions. A single call of the compiler may
+    take minutes, during which Ctrl-C would have no effect. The operating system's default
+    action, which ends the process, is therefore restored. The first process of a container (PID
+    1) has no default action, so a thread ends that process.
 
     Returns:
-        A function that restores the handlers of the signals.
+        A function that restores the signal handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         # Python permits only the main thread to change handlers.
@@ -164,7 +164,7 @@ def end_process_at_signals() -> Callable[[], None]:
     unwatch = _watch_signals() if is_first_process else lambda: None
 
     def restore() -> None:
-        """Restores the earlier signal handlers, so that loops can check for signals again."""
+        """Restores the previous signal handlers, so that loops can check for signals again."""
         unwatch()
         for number, handler in replaced.items():
             signal.signal(number, handler)
@@ -173,19 +173,19 @@ def end_process_at_signals() -> Callable[[], None]:
 
 
 def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
-    """Ends the process at once with the exit code that shells give to a signal, 128 + number.
+    """Ends the process immediately with the exit code 128 + number, as shells do.
 
-    This is the signal handler during a compilation in the first process of a container.
+    Used as the signal handler during compilation in the first process of a container.
     """
     os._exit(128 + number)
 
 
 def _watch_signals() -> Callable[[], None]:
-    """Starts a thread that ends the process as soon as an ending signal arrives.
+    """Starts a thread that ends the process as soon as a termination signal arrives.
 
     Python's signal handler in C writes the number of each signal into a pipe
-    (`signal.set_wakeup_fd`). The thread reads the pipe, and therefore works even while the main
-    thread is inside the compiler.
+    (`signal.set_wakeup_fd`). Since the thread reads from this pipe, it works even while the
+    main thread is inside the compiler.
 
     Returns:
         A function that stops the thread.
@@ -198,10 +198,10 @@ def _watch_signals() -> Callable[[], None]:
     previous_descriptor = signal.set_wakeup_fd(writer)
 
     def wait() -> None:
-        """Ends the process as soon as a signal arrives that requests its end.
+        """Ends the process as soon as a termination signal arrives.
 
-        The function runs in a thread of its own. Python writes the number of each signal into a
-        pipe, which the function reads until `unwatch` closes the pipe.
+        Runs in a separate thread. Python writes the number of each signal into a pipe, from
+        which this function reads until `unwatch` closes the pipe.
         """
         with os.fdopen(reader, "rb", 0) as pipe:
             while data := pipe.read(1):  # a byte with the number of the signal
@@ -210,7 +210,7 @@ def _watch_signals() -> Callable[[], None]:
                     os._exit(128 + number)
 
     def unwatch() -> None:
-        """Ends the thread that waits for signals, by closing the pipe that it reads."""
+        """Ends the thread that waits for signals by closing its pipe."""
         signal.set_wakeup_fd(previous_descriptor)
         os.close(writer)
 
@@ -219,9 +219,9 @@ def _watch_signals() -> Callable[[], None]:
 
 
 def _may_interrupt(owner: object) -> bool:
-    """Returns True if a signal may interrupt the present work of the process.
+    """Returns True if a signal may interrupt the current work of the process.
 
-    The object that handles the signal decides this.
+    This is decided by the object that handles the signal.
 
     Args:
         owner: Object whose method handles the signal. None if the handler is a plain function.
@@ -231,11 +231,11 @@ def _may_interrupt(owner: object) -> bool:
 
 @contextmanager
 def hold_sigint() -> Iterator[None]:
-    """Delays Ctrl-C inside the `with` block, and hides it from processes started in the block.
+    """Delays Ctrl-C inside the `with` block, and shields processes started in it from Ctrl-C.
 
-    Blocking the signal hides it from the started processes, which inherit the signal mask. The
-    mask alone does not delay Ctrl-C in this process: another thread may receive the signal, and
-    Python then runs the handler in the main thread. Therefore the handler is replaced as well.
+    The signal is blocked, and the started processes inherit the signal mask. The mask alone
+    does not delay Ctrl-C in this process: another thread may receive the signal, and Python
+    then runs the handler in the main thread. The handler is therefore also replaced.
     """
     is_main_thread = threading.current_thread() is threading.main_thread()
     # Windows has no signal masks, and only the main thread may change handlers.

@@ -1,7 +1,8 @@
-"""Parses TOML texts from sources that are not trusted, such as logs and other computers.
+"""Parses TOML from untrusted sources, such as logs and other computers.
 
 Invariant:
-    - The time for a text is at most proportional to its length, times the depth of its tables.
+    - The parsing time is at most proportional to the length of the text times the depth of its
+      tables.
 """
 
 import re
@@ -11,19 +12,20 @@ from typing import Any
 from .errors import ScenarioError
 
 _MAX_KEY_PARTS = 32
-"""Largest number of parts of a dotted key. Scenarios need four, as in sites.m1.arm.l1_m."""
+"""Largest number of parts of a dotted key. Scenarios need four, for example sites.m1.arm.l1_m.
+"""
 
 _KEY_PART = re.compile(
     r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)"""
 )
-"""Matches the next piece of a line: a part of a key, a dot, or another character."""
+"""Matches the next token of a line: a part of a key, a dot, or another character."""
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Returns the tables of a TOML text.
+    """Parses a TOML document, and returns its tables.
 
     Raises:
-        ScenarioError: The text is not TOML, or has a key of very many parts.
+        ScenarioError: The text is not valid TOML, or a key has too many parts.
         RecursionError: The tables are nested too deeply.
     """
     _refuse_long_keys(text)
@@ -35,13 +37,13 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def _refuse_long_keys(text: str) -> None:
-    """Refuses a text with a dotted key that has very many parts.
+    """Raises ScenarioError if a dotted key in the text has too many parts.
 
-    The time that a TOML parser needs grows faster than the square of the number of parts, so a
+    The running time of a TOML parser grows faster than the square of the number of parts, so a
     short text from an untrusted source could block the program.
 
     Raises:
-        ScenarioError: There is such a key. The error contains the number of its line.
+        ScenarioError: A key has too many parts. The error contains its line number.
     """
     for number, line in enumerate(text.split("\n"), 1):
         if line.count(".") < _MAX_KEY_PARTS:

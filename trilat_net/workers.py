@@ -1,13 +1,13 @@
-"""Starts worker processes, which compute the parts of a large task at the same time.
+"""Starts worker processes, which compute the parts of a large task in parallel.
 
-For example, a parameter sweep gives each of its runs to one of the workers:
+For example, a parameter sweep assigns each of its runs to one of the workers:
 
     with worker_pool(count_cores()) as pool:
         results = list(pool.map(compute_run, settings))
 
 Invariant:
-    - Worker processes ignore Ctrl-C, and leave it to the process that started them. They end
-      when that process ends or fails.
+    - Worker processes ignore Ctrl-C, which is handled by the process that started them. They
+      end when that process ends or fails.
 """
 
 import os
@@ -22,14 +22,13 @@ from .errors import TrilatError
 from .signals import hold_sigint
 
 _PARENT_POLL_S = 0.5
-"""Period in which a worker process checks that its parent process still exists, in s."""
+"""Interval, in s, at which a worker process checks that its parent process still exists."""
 
 
 def count_cores() -> int:
     """Returns the number of processors that this process may use.
 
-    The number may be smaller than the number of processors of the machine, for example in a
-    container.
+    This may be fewer than the machine has, for example in a container.
     """
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
@@ -38,11 +37,12 @@ def count_cores() -> int:
 
 @contextmanager
 def worker_pool(count: int) -> Iterator[Executor]:
-    """Yields an executor with worker processes, which have all ended when the block ends.
+    """Context manager that yields an executor with worker processes.
 
-    The processes are started anew, not forked, so that threads and compiled code are safe. They
-    do not import the script of the caller. If the block raises an exception, for example
-    because of Ctrl-C, they are killed in the middle of their work.
+    All processes have ended when the block exits. They are spawned rather than forked, which is
+    safe with threads and compiled code, and do not import the caller's script. If the block
+    raises an exception, for example because of Ctrl-C, the processes are killed in the middle
+    of their work.
 
     Args:
         count: Number of processes.
@@ -67,13 +67,13 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 
 def _prepare_worker(parent: int, in_command: bool) -> None:
-    """Prepares a new worker process, so that only its parent process decides when it ends.
+    """Prepares a new worker process, so that its lifetime is controlled only by its parent.
 
     The worker ignores Ctrl-C, and ends as soon as its parent has ended.
 
     Args:
-        parent: Process number of the parent.
-        in_command: True if the parent runs a command of `trilat`, which changes the wording of
+        parent: Process ID of the parent.
+        in_command: True if the parent runs a command of `trilat`, which affects the wording of
             errors (`TrilatError.in_command`).
     """
     TrilatError.in_command = in_command
@@ -82,13 +82,13 @@ def _prepare_worker(parent: int, in_command: bool) -> None:
 
 
 def _exit_after(parent: int) -> None:
-    """Ends this worker process as soon as its parent process has ended, however it ended.
+    """Ends this worker process as soon as its parent process has ended for any reason.
 
-    The function waits in a thread. Without this thread, workers would continue computing after
-    their parent was killed.
+    Runs in a thread. Without this thread, workers would continue computing after their parent
+    was killed.
 
     Args:
-        parent: Process number of the parent.
+        parent: Process ID of the parent.
     """
     from multiprocessing import connection, parent_process
 

@@ -12,9 +12,8 @@ import numpy as np
 import trilat_net
 from tests.log.builders import open_bytes, replace_fields, rewrite_log
 from tests.scenario.builders import rough_arm_text
-from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.core.step.ticks import LinkCounts
 from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork
@@ -371,7 +370,7 @@ class AnalysedRun:
 
     @cached_property
     def certificate(self) -> Certificate:
-        return certify_log(self.log)
+        return Certificate.of_log(self.log)
 
 
 _runs: dict[str, AnalysedRun] = {}

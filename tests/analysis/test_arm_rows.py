@@ -12,6 +12,8 @@ from trilat_net.analysis.arm_rows import (
     ArmRows,
     ChainArmRows,
     PlanarArmRows,
+)
+from trilat_net.analysis.base_parameters import (
     find_base_parameters,
     find_consistent_links,
     find_pseudo_inertias,

@@ -12,9 +12,9 @@ from tests.log.builders import edit_log_bytes, make_log_bytes, open_bytes
 from trilat_net.analysis.dominance_history import (
     DominanceHistory,
     DominancePlan,
+    PeerLoss,
     compute_lyapunov_weights,
     find_kd_scales,
-    find_lost_peers,
 )
 from trilat_net.core.links.dominance import DominanceMatrix, apply_ramps
 from trilat_net.core.links.link import link_dtype
@@ -153,7 +153,6 @@ def test_a_record_without_lost_peers_is_reported(mem: list[float]) -> None:
     broken = edit_log_bytes(
         data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
     )
-    times_s = np.array([0.05])
-    assert not find_lost_peers(open_bytes(data), "s", times_s).any()
+    assert PeerLoss.list_of_log(open_bytes(data)) == []
     with pytest.raises(LogError, match="a record of s does not have 12 numbers in `mem`"):
-        find_lost_peers(open_bytes(broken), "s", times_s)
+        PeerLoss.list_of_log(open_bytes(broken))

@@ -14,7 +14,6 @@ from trilat_net.analysis.twins.envelope_trend import (
     FLOOR_RAD,
     EnvelopeFit,
     EnvelopeTrend,
-    fit_envelopes,
 )
 
 Array = NDArray[np.float64]
@@ -29,7 +28,7 @@ phases = st.floats(0.0, 2.0 * math.pi)
 
 
 def fit_envelope(t_s: np.ndarray, envelope: np.ndarray) -> EnvelopeFit:
-    return fit_envelopes(t_s, envelope[:, np.newaxis])[0]
+    return EnvelopeFit.fit_columns(t_s, envelope[:, np.newaxis])[0]
 
 
 def make_oscillation(

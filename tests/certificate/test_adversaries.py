@@ -12,7 +12,6 @@ from tests.certificate.adversaries import count_judgements
 from tests.certificate.drawn_loops import make_experiment
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.describe import describe_law_conditions
 
 from .adversaries import (
     ROWS,
@@ -77,7 +76,7 @@ def _measure_speeds(scenario: Scenario, *at_s: float) -> list[float]:
 def test_every_drawn_laws_condition_has_a_value() -> None:
     """The condition of every law has a value in any space, for any number of sites and links."""
     for seed in range(WIDE_FROM, WIDE_FROM + 120):
-        assert describe_law_conditions(draw_experiment(seed).scenario) is not None
+        assert draw_experiment(seed).scenario.describe_law_conditions() is not None
 
 
 def _find_scenario(what: str) -> Scenario:

@@ -23,7 +23,7 @@ from tests.certificate.sampled_loops import (
     make_sine_delay,
 )
 from tests.execution.builders import make_log_with_commands, run_fused
-from trilat_net.analysis.certificate.certificate_result import Certificate
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.timeline import Timeline
 from trilat_net.own_code.code_consent import allow_own_code

@@ -18,7 +18,6 @@ from trilat_net.analysis.run_end import Stability
 from trilat_net.execution.twins import Push, Twins
 from trilat_net.presentation.observed_text import NEGATIVE_ENERGY_MEANING
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.describe import describe_law_conditions
 
 from .sampled_loops import SampledLoop
 
@@ -102,7 +101,7 @@ def test_passive_laws_prove_bounded_motion_and_no_decay(law: str) -> None:
         scenario = make_unit_scenario(
             {"m": {}, "s": {}}, {"law": law}, link=link, duration_s=5.0
         )
-        conditions = describe_law_conditions(scenario)
+        conditions = scenario.describe_law_conditions()
         assert conditions
         for line in conditions:
             assert "holds: motion stays bounded (decay is not proved)" in line
@@ -131,7 +130,7 @@ SAMPLING = "but sampling breaks it here: the roots of the sampled loop grow"
 def test_conditions_say_where_sampling_breaks_them(d: float, grows: bool) -> None:
     """A condition of continuous time holds at any rate, and beside growing roots says so."""
     scenario = write_slow_pair(d)
-    (alone,) = describe_law_conditions(scenario)
+    (alone,) = scenario.describe_law_conditions()
     assert " holds: " in alone
     assert "sufficient in continuous time" in alone
     analysis = tn.linear(scenario, ports=False)

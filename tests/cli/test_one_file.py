@@ -15,7 +15,7 @@ import typer
 
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import TextTable
-from ...work.executor import open_worker_pool
+from ...work.executor import WorkerPool
 from ...work.study_folder import RunJournal
 from . import options
 
@@ -44,7 +44,7 @@ def lag_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Measures how far the slave lags, seed by seed."""
-    with RunJournal(Path("lag.jsonl"), scenario, Lag, "make room") as journal, open_worker_pool(1) as pool:
+    with RunJournal(Path("lag.jsonl"), scenario, Lag, "make room") as journal, WorkerPool.open(1) as pool:
         left = [(scenario, seed) for seed in range(seeds) if (scenario, seed) not in journal.done]
         journal.run_pending(pool, measure_lag, left, seeds - len(left), seeds, lambda *_, **__: None)
         rows = {str(one.seed): one.rms_error_rad for one in journal.done.values()}

@@ -9,8 +9,7 @@ import pytest
 
 from tests.cli.running import build_command
 from trilat_net.app.cli import _SUBJECTS, _SYNONYMS
-from trilat_net.app.cli.options import find_split_setting
-from trilat_net.errors import find_nearest, suggest_nearest
+from trilat_net.errors import find_nearest, join_arguments, suggest_nearest
 
 from .running import trilat
 
@@ -93,10 +92,11 @@ def test_a_setting_split_by_the_shell_needs_quotes(
     shell = subprocess.run([bash, "-c", line], capture_output=True, text=True, check=True)
     arguments = shell.stdout.splitlines()
     assert len(arguments) > 2
-    assert find_split_setting(arguments) == setting
     said = in_one_line(trilat(command, "paper", *arguments, cwd=tmp_path).err)
-    assert "put it into quotes" in said
-    assert find_split_setting(["--set", setting, "--force"]) == ""
+    quoted = join_arguments(["--set", setting])
+    assert f"put it into quotes, as in {quoted}" in said
+    said = trilat(command, "paper", "--set", setting, "--absent", cwd=tmp_path).err
+    assert "put it into quotes" not in in_one_line(said)
 
 
 @pytest.mark.parametrize(
@@ -109,8 +109,9 @@ def test_a_setting_split_by_the_shell_needs_quotes(
         ["--set", "no form"],
     ],
 )
-def test_whole_settings_stay_unchanged(arguments: list[str]) -> None:
-    assert find_split_setting(arguments) == ""
+def test_whole_settings_need_no_quotes(arguments: list[str], tmp_path: Path) -> None:
+    said = trilat("sim", "paper", "--absent", *arguments, cwd=tmp_path).err
+    assert "put it into quotes" not in in_one_line(said)
 
 
 def test_faint_similarity_suggests_nothing() -> None:

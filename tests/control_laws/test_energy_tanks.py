@@ -24,7 +24,6 @@ from tests.log.builders import open_bytes, simulate_bytes
 from tests.unit_arm import H50, make_spring_hand, make_unit_scenario
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.execution.verification import verify_log
-from trilat_net.scenario.describe import describe_law_conditions
 
 TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40.0}
 
@@ -79,9 +78,9 @@ def test_no_shares_overdraw_the_tanks(by_shares: bool) -> None:
 
 
 def test_a_tank_sends_at_most_its_energy() -> None:
-    lines = describe_law_conditions(
-        make_energy_pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0)
-    )
+    lines = make_energy_pair(
+        {**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0
+    ).describe_law_conditions()
     assert "does not hold: a tank sends 2 times its energy per tick" in lines[0]
 
 
@@ -143,9 +142,9 @@ def test_compiled_and_stepped_runs_agree_and_verify(law: str) -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_a_scenario_states_its_laws_premises(law: str) -> None:
-    (line, *_) = describe_law_conditions(
-        make_energy_pair(LAWS[law], clamped=False, duration_s=1.0)
-    )
+    (line, *_) = make_energy_pair(
+        LAWS[law], clamped=False, duration_s=1.0
+    ).describe_law_conditions()
     assert line.startswith(f"condition of {law} at m")
     assert "holds: motion stays bounded (decay is not proved)" in line
     assert "stable" not in line

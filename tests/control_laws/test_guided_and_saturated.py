@@ -12,7 +12,6 @@ from trilat_net.core.arms.elementary import tanh
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.describe import describe_law_conditions
 
 SATURATED = {"law": "saturated_pd", "K": 100.0, "P": 5.0, "d": 20.0}
 P_D = {"law": "p_d", "K": 100.0, "d": 20.0}
@@ -97,9 +96,9 @@ def test_lee_and_spong_bound_holds_at_edge(
     """The bound is the published one, and K h more for torques that are held."""
     link = {"model": "constant", "delay_ms": 200.0 + more_ms}
     law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
-    conditions = describe_law_conditions(
-        make_unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme)
-    )
+    conditions = make_unit_scenario(
+        {"m": {}, "s": {}}, law, link=link, scheme=scheme
+    ).describe_law_conditions()
     text = "4 (d1 - K1 h / 2) (d2" if scheme == "digital" else "4 d1 d2 >= (T1 + T2)^2 K1 K2"
     assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in conditions[0]
 
@@ -128,7 +127,7 @@ def test_users_share_authority_and_feel_no_environment() -> None:
         rest = read_last_rows(scenario, 40.0)[0]
         assert rest["q"][:, 0] == pytest.approx([0.3, -0.3, slave], abs=1e-9)
         assert rest["tau_x"][:2, 0] == pytest.approx([-15.0, 45.0], abs=1e-4)
-    text = " ".join(describe_law_conditions(scenario))
+    text = " ".join(scenario.describe_law_conditions())
     bound = "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, T1 + T2 + h = 401 ms"
     assert f"authority at m1, m2 holds: {bound}" in text
     assert "authority at s holds: it follows and closes no loop" in text
@@ -138,7 +137,7 @@ def test_a_single_user_closes_no_loop() -> None:
     law = {"law": "authority", "K": 100.0, "d": 20.0}
     followers = {name: {"control": {"leads": False}} for name in TRIO[1:]}
     scenario = make_trio_scenario(law, (0.75, 0.25), {TRIO[0]: {}, **followers})
-    text = " ".join(describe_law_conditions(scenario))
+    text = " ".join(scenario.describe_law_conditions())
     assert f"authority at {TRIO[0]} holds: no arm follows another" in text
 
 
@@ -150,7 +149,7 @@ def test_impedances_yield_as_configured() -> None:
     free = make_trio_scenario(law, (0.75, 0.25), sites)
     rest = read_last_rows(free, 40.0)[0]
     assert rest["q"][:, 0] == pytest.approx([0.06, 0.0, 0.045], abs=1e-9)
-    assert "holds: the slave touches nothing" in describe_law_conditions(free)[0]
+    assert "holds: the slave touches nothing" in free.describe_law_conditions()[0]
     sites["s"]["hands"] = [CLAMP]
     held = read_last_rows(make_trio_scenario(law, (0.75, 0.25), sites), 40.0)[0]
     f = held["tau_x"][2, 0]  # the force on the environment
@@ -272,9 +271,9 @@ def test_the_condition_includes_the_masters_hands(name: str) -> None:
     """A weak hand leaves the gain below one, and the strongest hand does not."""
     loop, delay_ms, _ = HELD_LOOPS[name]
     for held, verdict in ((0.0, "holds"), (3.0, "holds"), (loop["hand"], "does not hold")):
-        condition = describe_law_conditions(
-            make_impedance_scenario(loop, make_constant_link(delay_ms), 12.0, hand=held)
-        )[0]
+        condition = make_impedance_scenario(
+            loop, make_constant_link(delay_ms), 12.0, hand=held
+        ).describe_law_conditions()[0]
         # the hand may let go
         gain = max(largest_loop_gain(loop, 0.0), largest_loop_gain(loop, held))
         assert f" {verdict}: the loop gain is at most " in condition
@@ -286,7 +285,7 @@ def test_free_slave_condition_names_the_stiffest_wall() -> None:
     untouched = make_impedance_scenario(
         LOOP, make_constant_link(20.0), 12.0, hand=LOOP["hand"], wall=False
     )
-    assert "up to 6.123 N m/rad at the slave" in describe_law_conditions(untouched)[0]
+    assert "up to 6.123 N m/rad at the slave" in untouched.describe_law_conditions()[0]
 
 
 def test_other_hands_leave_small_gain_undecided() -> None:
@@ -296,10 +295,10 @@ def test_other_hands_leave_small_gain_undecided() -> None:
         for master, slave in (([hand_], [make_spring(5.0)]), ([], [hand_])):
             follows = {"control": {"follows": True}, "hands": slave}
             scenario = make_unit_scenario({"m": {"hands": master}, "s": follows}, law)
-            assert "is undecided: known for springs" in describe_law_conditions(scenario)[0]
+            assert "is undecided: known for springs" in scenario.describe_law_conditions()[0]
         alone = {"control": {"follows": True}}
         scenario = make_unit_scenario({"m": {"hands": [hand_]}, "s": alone}, law)
-        assert "no bound is known for walls" in describe_law_conditions(scenario)[0]
+        assert "no bound is known for walls" in scenario.describe_law_conditions()[0]
 
 
 SWING = {"model": "sine", "delay_ms": 440.0, "amplitude_ms": 137.0, "period_s": 1.6243}
@@ -314,15 +313,15 @@ SWINGS = (
 
 
 def test_gains_below_one_need_constant_delays() -> None:
-    condition = describe_law_conditions(make_impedance_scenario(SWINGING, SWING, 10.0))[0]
+    condition = make_impedance_scenario(SWINGING, SWING, 10.0).describe_law_conditions()[0]
     assert "is undecided: known for constant delays" in condition
-    condition = describe_law_conditions(
-        make_impedance_scenario(SWINGING, make_constant_link(440.0), 10.0)
-    )[0]
+    condition = make_impedance_scenario(
+        SWINGING, make_constant_link(440.0), 10.0
+    ).describe_law_conditions()[0]
     assert " holds: the loop gain is at most 0.9" in condition
-    condition = describe_law_conditions(
-        make_impedance_scenario(SWINGING, SWING, 10.0, wall=False)
-    )[0]
+    condition = make_impedance_scenario(
+        SWINGING, SWING, 10.0, wall=False
+    ).describe_law_conditions()[0]
     assert " holds: the slave touches nothing" in condition
 
 
@@ -394,8 +393,8 @@ def test_saturated_pull_and_gravity_stay_below_limits() -> None:
         axis=1
     )
     room = np.array(spec.limits.tau_limit_nm) - gravity - 5.0
-    (line, *_) = describe_law_conditions(scenario)
+    (line, *_) = scenario.describe_law_conditions()
     assert f"is within tau_limit_nm up to {room.min() / 4.0:.3g} rad/s" in line
     limit = {"limits.tau_limit_nm": float(gravity.max() + 4.0)}
-    (line, *_) = describe_law_conditions(load_scenario("paper", {**changes, **limit}))
+    (line, *_) = load_scenario("paper", {**changes, **limit}).describe_law_conditions()
     assert "does not hold: tau_limit_nm of joint 1 is 1 N m below gravity + P" in line

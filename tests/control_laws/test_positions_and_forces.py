@@ -25,12 +25,10 @@ from tests.unit_arm import (
     read_last_rows,
 )
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares, complementary_weights
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.describe import describe_law_conditions
 
 SHARED = {  # factor: user 1 and user 2 at 0.1 and 1 Hz without and with qdd; rightmost root; beta_s / beta
     0.0: ((0.201, 0.278, 0.201, 0.278), (0.999, 0.921, 1.0, 1.0), -5.858, (np.inf, 1.0)),
@@ -186,13 +184,13 @@ def test_full_acceleration_one_tick_late_is_unstable() -> None:
     rows = read_last_rows(three_sites(0.5, 0, acceleration=1.0), 9.0)[0]
     assert np.abs(rows["qd"]).max() > 100.0
     assert (
-        "does not hold: " in describe_law_conditions(three_sites(0.5, 0, acceleration=1.0))[0]
+        "does not hold: " in three_sites(0.5, 0, acceleration=1.0).describe_law_conditions()[0]
     )
 
 
 def test_the_linear_loop_has_the_law_without_acceleration() -> None:
     loop = analyse_linear_loop(three_sites(0.25, 5), pose=(0.0, 0.0)).loop
-    A = set_common_delay(loop, 0.0).A
+    A = loop.set_common_delay(0.0).A
     alpha = complementary_shares(0.25)
     assert np.linalg.eigvals(A).real.max() == pytest.approx(
         rightmost_root(alpha, [(0.0, 0.0), (0.0, 0.0), (500.0, 5.0)]), abs=1e-6
@@ -202,7 +200,7 @@ def test_the_linear_loop_has_the_law_without_acceleration() -> None:
 def test_shares_without_a_single_factor_are_reported() -> None:
     assert (
         "a = 0.25, weights beta = (0.4375, 0.9375, 0.8125)"
-        in describe_law_conditions(three_sites(0.25, 0))[0]
+        in three_sites(0.25, 0).describe_law_conditions()[0]
     )
     others = {
         "u1": {"u2": 0.5, "s": 0.5},
@@ -214,7 +212,7 @@ def test_shares_without_a_single_factor_are_reported() -> None:
     )
     assert (
         "does not hold: the shares are not those of one factor"
-        in describe_law_conditions(scenario)[0]
+        in scenario.describe_law_conditions()[0]
     )
 
 

@@ -8,7 +8,6 @@ import pytest
 from tests.unit_arm import make_unit_scenario, read_last_rows
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.describe import describe_law_conditions
 
 PENDULUM = {
     "l1_m": 1.0,
@@ -65,7 +64,7 @@ def test_under_gravity_any_start_ends_at_zero(starts: tuple[float, ...]) -> None
         -0.5,
     ):
         assert first == pytest.approx([-6.4e-5, 5.9e-5], rel=0.035)
-    assert "at q = 0 or hanging" in describe_law_conditions(scenario)[0]
+    assert "at q = 0 or hanging" in scenario.describe_law_conditions()[0]
 
 
 @pytest.mark.parametrize(
@@ -124,7 +123,7 @@ def test_other_gains_make_the_start_decide_rest(name: str, height: str) -> None:
     first_joint_rad = -0.5 * np.pi if height == "low" else 0.0
     assert last["q"][:, 0] == pytest.approx(first_joint_rad, abs=5e-3)
     assert last["q"][:, 1] == pytest.approx(0.0, abs=5e-3)
-    assert "at q = 0 or hanging" in describe_law_conditions(scenario)[0]
+    assert "at q = 0 or hanging" in scenario.describe_law_conditions()[0]
 
 
 @pytest.mark.long

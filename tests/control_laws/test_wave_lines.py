@@ -15,7 +15,6 @@ from tests.unit_arm import CLAMP, make_spring_hand, make_unit_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.wave import Wave
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.describe import describe_law_conditions
 
 b = 10.0
 h = 1e-3
@@ -255,7 +254,7 @@ def test_three_sites_are_springs_b_over_t() -> None:
     for name, q, known in zip(run, rest, (0.14602, -0.14602, 0.09292), strict=True):
         assert q == pytest.approx(known, rel=3e-3)
         assert run[name].q[-1, 0] == pytest.approx(q, abs=1e-5)
-    assert "m2 0.1, s 0.9" in describe_law_conditions(scenario)[0]
+    assert "m2 0.1, s 0.9" in scenario.describe_law_conditions()[0]
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.ros2.published import Ros2Topics
 from trilat_net.log.view_rates import FULL_RATE_HZ
-from trilat_net.presentation.rerun_viewer import build_plot_layout
+from trilat_net.presentation.rerun_viewer import PlotLayout
 from trilat_net.scenario import load_scenario
 
 LAW = "tests.channel_law:Talking"
@@ -118,7 +118,7 @@ def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
             for message in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])
         ]
     assert vectors == log["m2"].sent["target[s]"].tolist()
-    page = build_plot_layout(channels).pages["Sent by laws"]
+    page = PlotLayout.of_channels(channels).pages["Sent by laws"]
     assert [plot.title for plot in page[0]] == [
         f"{site}: energy that the law sends to all (J)" for site in SITES
     ]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.errors import LogError
 from trilat_net.execution import SimulatedLog, simulate_columns
 from trilat_net.log import UnwrittenLog
@@ -47,8 +47,8 @@ def test_columns_equal_those_of_a_written_log(name: str, settings: dict[str, Any
 @pytest.mark.parametrize(("name", "settings"), RUNS)
 def test_its_certificate_is_that_of_a_written_log(name: str, settings: dict[str, Any]) -> None:
     scenario = load_scenario(name, {"duration_s": 1.0, **settings})
-    written = certify_log(SimulatedLog(scenario)).to_dict()
-    unwritten = certify_log(simulate_columns(scenario)).to_dict()
+    written = Certificate.of_log(SimulatedLog(scenario)).to_dict()
+    unwritten = Certificate.of_log(simulate_columns(scenario)).to_dict()
     assert json.dumps(unwritten) == json.dumps(written)
 
 

@@ -20,7 +20,6 @@ from trilat_net.execution.log_checks import LogCheckReport
 from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
-from trilat_net.own_code.code_consent import find_user_laws
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.run_changes import LinkTables, resolve_change
 
@@ -85,7 +84,7 @@ def test_hidden_memory_shows_at_a_restart() -> None:
 
 def test_reports_explain_hidden_memory() -> None:
     log = open_bytes(make_own_law_bytes("tests.laws:Forgetful"))
-    (law,) = find_user_laws(log.scenario)[:1]
+    (law,) = log.scenario.inspect_user_laws()[:1]
 
     def find_text(**settings: int) -> str:
         findings = LogCheckReport.of_log(log, virtual=False, **settings).findings
@@ -143,11 +142,11 @@ def make_log_stream(file: Path) -> io.BytesIO:
 def test_changed_files_are_judged_on_request(file: Path) -> None:
     stream = make_log_stream(file)
     log = open_log(stream)
-    (law,) = find_user_laws(log.scenario)
+    (law,) = log.scenario.inspect_user_laws()
     assert (law.sites, law.allowed, law.changed) == (("m", "s"), True, "")
     assert "is the one that ran" in str(law)
     file.write_text(file.read_text() + "# a word\n")
-    (law,) = find_user_laws(log.scenario)
+    (law,) = log.scenario.inspect_user_laws()
     assert not law.allowed
     assert f"--law {file} --other-version (it was changed" in str(law)
     verdict = verify_log(log)
@@ -172,7 +171,7 @@ def reopen_log(stream: io.BytesIO, **how: Any) -> Log:
 def test_a_missing_file_names_the_remedy(file: Path) -> None:
     log = open_log(make_log_stream(file))
     file.unlink()
-    (law,) = find_user_laws(log.scenario)
+    (law,) = log.scenario.inspect_user_laws()
     assert str(law).endswith("external code, which may not run; if you trust it: --law FILE")
     assert verify_log(log).withheld == ["m", "s"]
 

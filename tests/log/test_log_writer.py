@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from tests.cli.running import trilat
 from tests.log.disks import open_file_on
-from trilat_net.app.cli.members import parse_split
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_file import LogFile
 from trilat_net.log.log_layout import part_path
@@ -207,9 +207,9 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [0.5, float("nan"), 0.0, 1e7])
-def test_an_invalid_part_is_refused(number: float) -> None:
-    with pytest.raises(UsageError, match="split_size must be a number of MiB"):
-        parse_split("--split-size", "MiB", number, 1 << 20)
+def test_an_invalid_part_is_refused(number: float, tmp_path: Path) -> None:
+    done = trilat("record", "--session", "x", "--split-size", str(number), cwd=tmp_path)
+    done.refuses("--split-size must be a number of MiB from 1 to 1e6")
 
 
 def test_continuing_and_replacing_at_once_is_refused(tmp_path: Path) -> None:

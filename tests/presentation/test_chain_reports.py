@@ -11,6 +11,7 @@ import trilat_net as tn
 from tests.core.chain_references import chain_references
 from tests.presentation.figure_content import list_misplaced
 from tests.scenario.builders import six_joint_text
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
@@ -31,9 +32,9 @@ def simulate_six_joints() -> Log:
 
 
 def test_chains_end_where_pinocchio_says():
-    arm = simulate_six_joints().scenario.arms["m1"]
+    arm = build_arm_rows(simulate_six_joints().scenario, "m1")
     states = chain_references()["arm6"].states
-    points = arm_poses.joint_positions_m(arm, np.array([state.q for state in states]))
+    points = arm.joint_positions_m(np.array([state.q for state in states]))
     assert points[:, -1] == pytest.approx(
         np.array([state.tip_position for state in states]), abs=1e-12
     )
@@ -43,14 +44,16 @@ def test_chains_end_where_pinocchio_says():
 
 
 def test_pictures_of_chains_have_shadows_below():
-    arm = simulate_six_joints().scenario.arms["m1"]
+    arm = build_arm_rows(simulate_six_joints().scenario, "m1")
     origin, above, aside = arm_poses.project_arm_m(
-        arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]])
+        arm.upright_axes, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]])
     )
     assert not origin.any()
     assert above[0] == pytest.approx(0.0)
     assert 0.8 < above[1] < 1.0
-    shadow = arm_poses.project_arm_m(arm, np.array([0.3, 0.2, 0.9]), onto_floor=True)
+    shadow = arm_poses.project_arm_m(
+        arm.upright_axes, np.array([0.3, 0.2, 0.9]), onto_floor=True
+    )
     assert shadow == pytest.approx(aside)
 
 
@@ -98,7 +101,7 @@ def test_tip_paths_appear_in_three_planes():
     assert names == [("x", "y"), ("x", "z"), ("y", "z")]
     for site, line in (("m1", 0), ("s", 6)):  # a path, its ring and its disc
         part = log[site]
-        points = arm_poses.joint_positions_m(log.scenario.arms[site], part.q[[0, -1]])[:, -1]
+        points = build_arm_rows(log.scenario, site).joint_positions_m(part.q[[0, -1]])[:, -1]
         for axes, plane in zip(panels, ([0, 1], [0, 2], [1, 2]), strict=True):
             path = axes.lines[line].get_xydata()
             assert path[[0, -1]] == pytest.approx(points[:, plane], abs=1e-12)
@@ -108,10 +111,8 @@ def test_wall_forces_equal_the_recorded_torques():
     """The wall's torque is the force times the end effector's motion along the normal, by
     differences of poses.
     """
-    arm = simulate_six_joints().scenario.arms["s"]
-    start = arm_poses.joint_positions_m(arm, np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[
-        0, -1
-    ]
+    arm = build_arm_rows(simulate_six_joints().scenario, "s")
+    start = arm.joint_positions_m(np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[0, -1]
     normal = np.array([0.6, -0.3, 0.74])
     wall = {
         "kind": "wall",
@@ -128,12 +129,10 @@ def test_wall_forces_equal_the_recorded_torques():
     across = normal / np.linalg.norm(normal)
     lever = np.empty((len(rows), 6))
     for joint, off in enumerate(1e-6 * np.eye(6)):
-        ends = [
-            arm_poses.joint_positions_m(arm, part.q[rows] + s * off)[:, -1] for s in (1, -1)
-        ]
+        ends = [arm.joint_positions_m(part.q[rows] + s * off)[:, -1] for s in (1, -1)]
         lever[:, joint] = (ends[0] - ends[1]) @ across / 2e-6
     assert force[:, None] * lever == pytest.approx(-part.tau_x[rows], abs=1e-5)
-    at = arm_poses.joint_positions_m(arm, part.q[rows])[:, -1]
+    at = arm.joint_positions_m(part.q[rows])[:, -1]
     depth_mm = 1e3 * np.maximum((start + 0.01 * normal - at) @ across, 0.0)
     assert depth_panel.lines[0].get_ydata() == pytest.approx(depth_mm, abs=1e-9)
 

@@ -19,6 +19,7 @@ import scipy.io
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
+from trilat_people.live_page.body_turns import BodyTurns
 from trilat_ros2.ros2_topics import BridgeEnds, SiteTopics
 
 import trilat_net as tn
@@ -34,7 +35,6 @@ from tests.turning import (
     make_turning_log,
     place_links,
 )
-from trilat_net.analysis.body_turns import BodyTurns
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.log.orientations import RotationVectors, align_signs, expand_poses

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
-from matplotlib.figure import Figure
 
 import trilat_net
 from tests.analysis.builders import make_busy_run, make_short_log
@@ -16,6 +15,7 @@ from tests.log.builders import add_clock_readings
 from tests.presentation.figure_content import list_curves
 from tests.scenario.builders import planar_task_text
 from trilat_net.analysis import site_signals
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.analysis.link_summary import DelayDistribution
 from trilat_net.analysis.timeline import Timeline
 from trilat_net.errors import UsageError
@@ -30,6 +30,7 @@ from trilat_net.presentation.figures import (
     run_overview,
 )
 from trilat_net.presentation.figures.registry import FIGURES
+from trilat_net.presentation.plot_signals import sample_ages_ms
 from trilat_net.scenario import load_scenario, parse_scenario
 
 BACKGROUND = 0.6
@@ -66,13 +67,10 @@ def test_a_single_site_has_the_widest_line():
 
 def test_histograms_count_every_tick():
     log = add_clock_readings(make_short_log("four"))
-    edges = age_and_lateness.choose_bin_edges_us(log)
+    bins = age_and_lateness.LoopTimeBins.of_log(log)
     for site in log.sites:
-        assert age_and_lateness.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
-        assert (
-            age_and_lateness.bin_loop_times(log[site].busy_us, edges).sum()
-            == len(log[site]) - 1
-        )
+        assert bins.count_times(log[site].late_us).sum() == len(log[site])
+        assert bins.count_times(log[site].busy_us).sum() == len(log[site]) - 1
 
 
 @pytest.mark.long
@@ -138,23 +136,27 @@ def test_each_site_has_estimates_beside_the_truth():
 def test_distributions_show_rare_long_ages():
     for few, even in ((20.0, True), (1.0, False)):
         ages_ms = np.where(np.arange(1000) < 10.0 * few, 3200.0, 200.0)
-        x_ms = age_and_lateness.choose_delay_axis_ms(
+        axis = age_and_lateness.DelayAxis.of_links(
             [DelayDistribution("a", "b", np.full(9, 200.0), ages_ms)]
         )
-        assert x_ms[-1] >= 3200.0
-        assert (x_ms[0] == 0.0) == even
+        assert axis.x_ms[-1] >= 3200.0
+        assert (axis.x_ms[0] == 0.0) == even
+        assert axis.is_logarithmic != even
 
 
 def test_ages_that_alternate_are_a_band():
-    seconds = np.arange(4000) / 1000.0
-    swings = np.arange(4000) % 5
-    assert age_and_lateness.is_unsteady(200.0 + 10.0 * swings)
-    assert not age_and_lateness.is_unsteady(200.0 + 1000.0 * np.maximum(seconds - 2.0, 0.0))
-    axes = Figure().subplots()
-    style.plot_spread(axes, seconds, 200.0 + 10.0 * swings, color="#004488")
-    (band,), (median,) = axes.collections, axes.lines
-    assert band.get_datalim(axes.transData).intervaly.tolist() == [200.0, 240.0]
-    assert set(median.get_ydata()) == {220.0}
+    link = {"links.m->s.model": "uniform", "links.m->s.delay_ms": 50.0}
+    log = trilat_net.simulate("two_sites", {"duration_s": 2.0, **link})
+    swinging, steady = FIGURES["sample_age"].draw(log).axes[::-1]
+    assert not steady.collections
+    (band,) = swinging.collections
+    ages_ms = sample_ages_ms(log, "s")
+    extremes_ms = [np.nanmin(ages_ms), np.nanmax(ages_ms)]
+    assert band.get_datalim(swinging.transData).intervaly.tolist() == extremes_ms
+    median = list_curves(swinging)[0].get_ydata()
+    known = median[np.isfinite(median)]
+    assert ((known > extremes_ms[0]) & (known < extremes_ms[1])).all()
+    assert len(known) > 100
 
 
 def test_slave_colours_are_independent_of_masters():
@@ -172,22 +174,20 @@ def test_ages_after_an_outage_are_logarithmic():
 
 
 def test_shares_are_fractions_of_the_total():
-    percent = age_and_lateness.compute_cumulative_percent(
-        np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0])
-    )
+    axis = age_and_lateness.DelayAxis(np.array([0.0, 2.0, 9.0]), is_logarithmic=False)
+    percent = axis.compute_percent(np.array([1.0, 2.0, 2.0, 4.0]))
     assert percent.tolist() == [0, 75, 100]
-    assert np.isnan(age_and_lateness.compute_cumulative_percent(np.zeros(0), np.zeros(2))).all()
+    assert np.isnan(axis.compute_percent(np.zeros(0))).all()
 
 
 def test_arms_stand_in_panels_with_equal_axes():
     log = make_short_log("four")
-    arm = log.scenario.arms["c"]
-    base, elbow, end_effector = arm_poses.joint_positions_m(
-        arm, np.array([[np.pi / 2, -np.pi / 2]])
-    )[0]
+    arm = build_arm_rows(log.scenario, "c")
+    base, elbow, end_effector = arm.joint_positions_m(np.array([[np.pi / 2, -np.pi / 2]]))[0]
     assert [*base, *elbow, *end_effector] == pytest.approx([0.0, 0.0, 0.0, 0.6, 1.0, 0.6])
-    instants = arm_poses.choose_instants_s(log)
     figure = FIGURES["arms"].draw(log)
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    instants = [float(title.removeprefix("t = ").removesuffix(" s")) for title in titles]
     assert len(figure.axes) == 4 * len(instants)
     for axes in figure.axes:
         assert axes.get_aspect() == 1.0
@@ -257,7 +257,6 @@ RAMPS = [
 
 def test_shares_are_drawn_as_they_change():
     log = trilat_net.simulate("paper", {"duration_s": 2.0, "rate_hz": 100, "timeline": RAMPS})
-    assert joint_motion.list_sites_with_changing_dominance(log) == ["s"]
     figure = FIGURES["authority"].draw(log)
     assert len(figure.axes) == 3
     m1, m2 = (line.get_data() for line in list_curves(figure.axes[0])[:2])
@@ -265,7 +264,7 @@ def test_shares_are_drawn_as_they_change():
         [0.5, 0.625, 0.75, 0.375, 0.0]
     )
     assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
-    assert joint_motion.list_sites_with_changing_dominance(make_short_log("paper")) == []
+    assert "authority" not in registry.list_drawable_figures(make_short_log("paper"))
 
 
 def test_overview_has_all_extremes_and_the_verdict():

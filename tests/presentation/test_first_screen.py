@@ -10,7 +10,7 @@ from tests.analysis.builders import make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import grave_findings, watched_page
 from trilat_net import presentation
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.log.findings import Finding
 from trilat_net.presentation.appearance import DARK_SITE_COLOURS, SITE_COLOURS
 from trilat_net.presentation.page import write_report
@@ -41,7 +41,7 @@ def test_report_fits_screens_and_axe_finds_nothing(
     name: str, browser: Browser, tmp_path: Path
 ) -> None:
     log = VARIED[name]()
-    path, _ = write_report(log, tmp_path, certificate=certify_log(log), verdicts=CHECKS)
+    path, _ = write_report(log, tmp_path, certificate=Certificate.of_log(log), verdicts=CHECKS)
     has_records = any(len(log[site]) for site in log.sites)
     for screen, (width, height) in SCREENS.items():
         for scheme in ("light", "dark"):
@@ -67,7 +67,7 @@ def test_report_fits_screens_and_axe_finds_nothing(
 @needs_browser
 def test_arms_play_at_once_unless_motion_is_reduced(browser: Browser, tmp_path: Path) -> None:
     log = make_short_log("paper")
-    path, _ = write_report(log, tmp_path, certificate=certify_log(log))
+    path, _ = write_report(log, tmp_path, certificate=Certificate.of_log(log))
     for motion, label in (("no-preference", "stop"), ("reduce", "play")):
         with watched_page(browser, reduced_motion=motion) as watched:
             watched.page.goto(path.as_uri())

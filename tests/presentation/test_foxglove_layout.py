@@ -14,7 +14,7 @@ from tests.cli.running import trilat
 from tests.log.builders import write_log
 from tests.scenario.builders import planar_task_text
 from trilat_net.errors import UsageError
-from trilat_net.presentation.viewer_files import write_foxglove_layout
+from trilat_net.presentation.foxglove_layout import write_foxglove_layout
 
 PATH = re.compile(r"(?P<topic>(/\w+)+)\.(?P<fields>[\w.]+)(\[(?P<index>\d+)\])?")
 """What our layouts use of the syntax of message paths: /topic.field.field[0]."""

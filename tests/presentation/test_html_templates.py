@@ -18,7 +18,7 @@ import trilat_net
 from tests.analysis.builders import FOUR, make_busy_run, make_short_log
 from tests.log.builders import add_clock_readings, rewrite_log
 from tests.presentation.varied_runs import make_fault_log
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log
@@ -77,7 +77,7 @@ def make_log_of_text(text: str) -> Log:
 
 def render_everything(log: Log, text: str) -> str:
     """Returns the report of a log, and the HTML in a notebook."""
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     findings = [Finding(text, text, False), Finding("executed again", text, True)]
     page = render_report(
         log,

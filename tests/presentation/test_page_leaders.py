@@ -12,17 +12,13 @@ from playwright.sync_api import Browser
 from tests.analysis.builders import make_busy_run, make_run, make_short_log
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import watched_page
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.charts import ChartBuilder
 from trilat_net.presentation.page import write_report
-from trilat_net.presentation.page_leaders import (
-    describe_leads,
-    describe_phases,
-    render_lead_bars,
-    trace_leads,
-)
+from trilat_net.presentation.page_charts import render_overview
+from trilat_net.presentation.page_leaders import SlaveLead
 
 SHORT = {"rate_hz": 100, "duration_s": 14.0, "expect": {}}
 
@@ -34,35 +30,41 @@ def simulate_training(**settings: Any) -> Log:
 
 def test_the_bar_is_the_dominance_at_every_tick() -> None:
     log = simulate_training()
-    (lead,) = trace_leads(log)
+    (lead,) = SlaveLead.list_of_log(log)
     t_s = log["s"].t_s
     alpha = DominanceHistory.of_log(log, "s", t_s).alpha
     for column, peer in enumerate(lead.peers):
         drawn = np.interp(t_s, lead.t_s, lead.shares[:, column])
         recorded = alpha[:, log.scenario.peers("s").index(peer)]
         assert drawn == pytest.approx(recorded, abs=1e-9)
-    assert describe_phases(lead) == "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %"
+    assert lead.describe_phases() == "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %"
 
 
 def test_a_sudden_change_is_a_step() -> None:
     step = {"at_s": 5.0, "dominance": "s", "to": {"m1": 0.2, "m2": 0.8}}
-    (lead,) = trace_leads(simulate_training(timeline=[step]))
+    (lead,) = SlaveLead.list_of_log(simulate_training(timeline=[step]))
     for at_s, share in ((4.999, 0.9), (5.0, 0.2), (9.0, 0.2)):
         assert np.interp(at_s, lead.t_s, lead.shares[:, 0]) == pytest.approx(share)
 
 
 def test_constant_dominance_is_a_sentence() -> None:
     log = simulate_training(timeline=[])
-    leads = trace_leads(log)
+    (lead,) = SlaveLead.list_of_log(log)
     sentence = "m1 leads the slave with 90 % and m2 with 10 %, during the whole run."
-    assert describe_leads(log, leads) == [sentence]
-    assert render_lead_bars(log, leads) == ""
+    assert lead.describe_constant(log.scenario) == sentence
+    builder = ChartBuilder(log, None)
+    data = builder.build().data
+    assert data.leads == []
+    overview = render_overview(log, builder, data.charts)
+    assert sentence in overview
+    assert 'class="lead"' not in overview
 
 
 def test_one_master_leads_alone() -> None:
     log = make_run("two_sites", {"rate_hz": 100, "duration_s": 1.0, "expect": {}}).log
-    sentences = describe_leads(log, trace_leads(log))
-    assert sentences == ["m alone leads the slave, during the whole run."]
+    (lead,) = SlaveLead.list_of_log(log)
+    sentence = "m alone leads the slave, during the whole run."
+    assert lead.describe_constant(log.scenario) == sentence
 
 
 @pytest.mark.parametrize("name", ["four", "busy"])
@@ -73,8 +75,8 @@ def test_every_following_slave_is_shown(name: str) -> None:
         for site, spec in log.scenario.sites.items()
         if spec.role == "slave" and any(log.scenario.dominance[site].values())
     }
-    assert {lead.slave for lead in trace_leads(log)} == followers
-    for lead in trace_leads(log):
+    assert {lead.slave for lead in SlaveLead.list_of_log(log)} == followers
+    for lead in SlaveLead.list_of_log(log):
         assert lead.shares.sum(axis=1) == pytest.approx(1.0)
 
 
@@ -95,7 +97,7 @@ def test_the_bar_stands_below_the_slider(
     size: tuple[int, int], browser: Browser, tmp_path: Path
 ) -> None:
     log = simulate_training()
-    path, _ = write_report(log, tmp_path, certificate=certify_log(log))
+    path, _ = write_report(log, tmp_path, certificate=Certificate.of_log(log))
     options: dict[str, Any] = {
         "viewport": {"width": size[0], "height": size[1]},
         "reduced_motion": "reduce",

@@ -10,7 +10,7 @@ from tests.analysis.builders import make_log_without_hands
 from tests.live.browsers import needs_browser, wait_until_page
 from tests.net.waiting import until
 from tests.page.whole_pages import WatchedPage, watched_page
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.page import render_report, write_report
@@ -222,7 +222,7 @@ def test_whole_report_with_its_certificate_is_drawn(
     """The report is that of the command, with the certificate, its pictures, and the twin without operators."""
     log = VARIED[name]()
     twin = make_log_without_hands("paper") if name == "shipped paper" else None
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     path, _ = write_report(log, tmp_path, certificate=certificate, twin=twin)
     observed = certificate.observed
     twins = certificate.twins

@@ -24,7 +24,6 @@ from trilat_net.presentation import rerun_viewer
 from trilat_net.presentation.rerun_viewer import (
     PlotLayout,
     ViewerOptions,
-    build_plot_layout,
     make_application_id,
     open_rerun,
 )
@@ -164,7 +163,7 @@ def build_layouts(
     files: dict[str, Path],
 ) -> dict[str, tuple[dict[str, Ros2Channel], PlotLayout]]:
     return {
-        kind: (Ros2Topics.of_file(path), build_plot_layout(Ros2Topics.of_file(path)))
+        kind: (Ros2Topics.of_file(path), PlotLayout.of_channels(Ros2Topics.of_file(path)))
         for kind, path in files.items()
     }
 
@@ -215,9 +214,9 @@ def test_a_bag_shows_the_reference_beside_the_joints(
 def test_missing_quantities_take_no_room(files: dict[str, Path]) -> None:
     rows = build_layouts(files)["virtual"][1].pages["Links, timing"]
     assert [row[0].title for row in rows] == ["m: age of samples in use, by peer (ms)"]
-    assert build_plot_layout({}) == PlotLayout({}, "")
+    assert PlotLayout.of_channels({}) == PlotLayout({}, "")
     assert (
-        build_plot_layout(
+        PlotLayout.of_channels(
             {"/viz/a/joint_states": Ros2Channel(JOINT_STATE, {"names": "a_q1"})}
         ).lines
         == ""

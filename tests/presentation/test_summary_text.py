@@ -4,7 +4,6 @@ Text tables: the same cells on a terminal, in Markdown and as lines.
 """
 
 from io import StringIO
-from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -22,11 +21,12 @@ from trilat_net.presentation.page_summary import render_alarms
 from trilat_net.presentation.result_text import TextTable
 from trilat_net.presentation.summary_text import (
     MOST_LINE_CHARACTERS,
-    format_clock_lines,
-    format_link_lines,
-    format_outside_lines,
     format_run_lines,
 )
+
+
+def list_lines(log, start):
+    return [line for line in format_run_lines(log) if line.startswith(start)]
 
 
 def test_constant_links_without_loss_get_no_line():
@@ -36,7 +36,8 @@ def test_constant_links_without_loss_get_no_line():
 
 def test_links_give_stated_and_measured_values():
     link = {"link.model": "uniform", "link.delay_ms": 200, "link.half_width_ms": 50}
-    line = format_link_lines(trilat_net.simulate("two_sites", {"duration_s": 2, **link}))[0]
+    log = trilat_net.simulate("two_sites", {"duration_s": 2, **link})
+    line = list_lines(log, "link ")[0]
     assert line.startswith("link s->m: stated uniform 150 to 250 ms; effective 16")
     assert " superseded " in line
     assert "lost" not in line
@@ -109,9 +110,9 @@ def test_foreign_records_raise_no_alarm(mem):
 
 def test_of_many_lines_the_first_are_shown(monkeypatch):
     monkeypatch.setattr(summary_text, "MOST_LINES", 2)
-    lines = format_link_lines(make_busy_run().log)
-    assert len(lines) == 3
-    assert lines[-1] == "and 4 more of this kind: see summary.json"
+    log = make_busy_run().log
+    assert len(list_lines(log, "link ")) == 2
+    assert "and 4 more of this kind: see summary.json" in format_run_lines(log)
 
 
 def make_statistics(tick, **clock):
@@ -158,7 +159,7 @@ def test_clocks_are_reported_as_at_the_end():
         2,
     )
     assert (use.drift_ppm, use.drift_bound_ppm) == (50.0, 0.9)
-    (line,) = format_clock_lines(make_clock_statistics())
+    (line,) = list_lines(make_clock_statistics(), "clock of ")
     assert line == (
         "clock of m1 seen by m2: +3000.100 ms at the end, known to 60 us (p50 130, max 200), "
         "drift +50.00 ppm, 2 samples arrived before they were sent: a clock has stepped"
@@ -170,13 +171,13 @@ def test_shared_clocks_get_no_line():
     assert shared is not None
     assert shared.shared
     assert ClockSummary.of_link(make_clock_statistics(), "m2", "m1") is None
-    assert format_clock_lines(make_short_log("paper")) == []
+    assert list_lines(make_short_log("paper"), "clock of ") == []
 
 
 def test_the_cause_of_the_end_is_one_line() -> None:
     long = "the law a:B of s failed at tick 3: \x1b[31m" + "x" * 1000
     said = [
-        SimpleNamespace(kind=kind, text=text)
+        Event(member="s", boot=1, kind=kind, text=text)
         for kind, text in (
             ("ready", "s is ready"),
             ("failed", long),
@@ -184,7 +185,7 @@ def test_the_cause_of_the_end_is_one_line() -> None:
             ("arm", "off"),
         )
     ]
-    failed, law, arm = format_outside_lines(SimpleNamespace(events=said))
+    failed, law, arm = format_run_lines(rewrite_log(make_short_log("paper"), others=said))
     assert (law, arm) == ("slow", "off")
     assert failed.startswith("the law a:B of s failed at tick 3:  [31mxxx")
     assert len(failed) == MOST_LINE_CHARACTERS

@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 import trilat_net
 from tests.core.chain_references import chain_references
 from tests.scenario.builders import SIX_JOINTS, make_six_joint_scenario
-from trilat_net.analysis.arm_rows import joint_positions_m
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.core.step.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify_log
 from trilat_net.scenario import load_scenario, parse_embedded
 from trilat_net.scenario.describe import list_arm_notes
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
-from trilat_net.scenario.scenario_reader import reseed_scenario
 from trilat_net.scenario.simulated_arm import SimulatedArm
 from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
 
@@ -62,10 +61,11 @@ def refusal(changes: Overrides) -> ScenarioError:
 @pytest.mark.long
 def test_shipped_arms_have_their_makers_data() -> None:
     """UR5: table C.3 of its manual, less than 18 kg with the base; Panda: 0.855 m and about 18 kg."""
-    ur5, panda = (load_scenario(name).arms["s"] for name in ("six_joints", "seven_joints"))
+    scenarios = [load_scenario(name) for name in ("six_joints", "seven_joints")]
+    ur5, panda = (build_arm_rows(scenario, "s") for scenario in scenarios)
     assert ur5.theta[::10].sum() == pytest.approx(17.05, abs=0.005)
     assert panda.theta[::10].sum() == pytest.approx(16.06, abs=0.005)
-    straight = joint_positions_m(ur5, np.zeros((1, 6)))[0]
+    straight = ur5.joint_positions_m(np.zeros((1, 6)))[0]
     assert math.dist(straight[5], straight[2]) == pytest.approx(
         math.hypot(0.425 + 0.39225, 0.10915)
     )
@@ -73,7 +73,7 @@ def test_shipped_arms_have_their_makers_data() -> None:
     poses = np.zeros((40**3, 7))
     # what the reach depends on
     poses[:, 3:6] = np.stack(np.meshgrid(*limits), axis=-1).reshape(-1, 3)
-    points = joint_positions_m(panda, poses)
+    points = panda.joint_positions_m(poses)
     assert np.linalg.norm(points[:, -1] - points[:, 1], axis=1).max() == pytest.approx(
         0.855, abs=0.004
     )
@@ -128,10 +128,10 @@ def test_one_number_applies_to_every_joint() -> None:
     assert len(inertias) == 12
     assert all(0.1 <= inertia <= 0.2 for inertia in inertias)
     assert drawn.arms["m1"].theta[50] != drawn.arms["s"].theta[50]  # mass of the last link
-    again = reseed_scenario(drawn, 2)
+    again = load_scenario(drawn, seed=2)
     assert again.sites["s"].arm.payload_kg != drawn.sites["s"].arm.payload_kg
     assert not inertias & {*again.sites["s"].arm.armature_kg_m2}
-    assert reseed_scenario(again, 1) == drawn
+    assert load_scenario(again, seed=1) == drawn
 
 
 def test_drawn_start_poses_move_tip_operators() -> None:
@@ -139,7 +139,7 @@ def test_drawn_start_poses_move_tip_operators() -> None:
     drawn = make_six_joint_scenario(
         **{"sites.m1.q0_rad": start, "sites.m1.hands": [TIP_SPRING]}
     )
-    again = reseed_scenario(drawn, 2)
+    again = load_scenario(drawn, seed=2)
     for scenario_drawn in (drawn, again):
         spec = scenario_drawn.sites["m1"]
         assert list(spec.hands[0].from_m) == scenario_drawn.arms["m1"].end_effector(spec.q0_rad)

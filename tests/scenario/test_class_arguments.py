@@ -7,7 +7,7 @@ import pytest
 
 import tests.own_laws
 from trilat_net.errors import ScenarioError
-from trilat_net.own_code.class_arguments import check_arguments, make_own_instance
+from trilat_net.own_code.class_arguments import make_own_instance
 
 
 class Any1:
@@ -24,7 +24,7 @@ class Needs:
 
 def refusal(kind: Any, **settings: Any) -> str:
     with pytest.raises(ScenarioError) as refused:
-        check_arguments(kind, "mine:Kind", settings, "sites.s.control")
+        make_own_instance(kind, "mine:Kind", None, settings, "sites.s.control")
     assert refused.value.path == "sites.s.control"
     return str(refused.value)
 

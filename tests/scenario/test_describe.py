@@ -11,7 +11,7 @@ from trilat_net.app.cli.options import list_laws
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import (
-    compare_scenarios,
+    ScenarioDifference,
     describe_scenario,
     describe_value,
 )
@@ -24,7 +24,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def compare_texts(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
     return {
         str(difference): difference.values
-        for difference in compare_scenarios(
+        for difference in ScenarioDifference.list_between(
             [load_scenario(name, sets) for name, sets in scenarios]
         )
     }

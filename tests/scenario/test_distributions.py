@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.distributions import Distribution
-from trilat_net.scenario.scenario_reader import reseed_scenario
 
 EXAMPLE: dict[str, Any] = {
     "sites.m1.q0_rad": {"normal": [0.1, 0.02]},
@@ -73,8 +72,8 @@ def test_canonical_text_holds_the_drawn_numbers() -> None:
 def test_another_seed_draws_again_from_any_source() -> None:
     """The source is a scenario or the text of a log, and hands that hold the start pose are drawn too."""
     for scenario in (
-        reseed_scenario(draw_scenario(1), 5),
-        reseed_scenario(parse_scenario(draw_scenario(2).text), 5),
+        load_scenario(draw_scenario(1), seed=5),
+        load_scenario(parse_scenario(draw_scenario(2).text), seed=5),
     ):
         assert scenario == draw_scenario(5)
         assert scenario.sha256 == draw_scenario(5).sha256
@@ -118,9 +117,9 @@ def test_changing_seeds_back_restores_the_experiment(
         ]
     first = load_scenario("free", {**EXAMPLE, **ranges, "seed": seeds[0]})
     assert parse_scenario(first.text).text == first.text
-    other = reseed_scenario(first, seeds[1])
+    other = load_scenario(first, seed=seeds[1])
     assert parse_scenario(other.text).text == other.text
-    assert reseed_scenario(other, seeds[0]) == first
+    assert load_scenario(other, seed=seeds[0]) == first
     for key, number in other.drawn.items():
         if number.uniform:
             assert number.uniform[0] - 1e-8 <= number.value <= number.uniform[1] + 1e-8, key
@@ -130,7 +129,7 @@ def test_replaced_numbers_stay() -> None:
     fixed = load_scenario(
         draw_scenario(1), {"sites.m1.q0_rad": [0.3, 0.0], "control.law": "p_d"}
     )
-    other = reseed_scenario(fixed, 2)
+    other = load_scenario(fixed, seed=2)
     assert other.sites["m1"].q0_rad == (0.3, 0.0)
     assert other.sites["m1"].arm == draw_scenario(2).sites["m1"].arm
     assert not any(".control." in key for key in other.drawn)

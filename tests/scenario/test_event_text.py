@@ -6,7 +6,7 @@ from typing import Any, get_args
 import pytest
 
 from trilat_net.recorded_change import SiteOrder
-from trilat_net.scenario.change import Change, describe_event, find_requester
+from trilat_net.scenario.change import Change
 
 CHANGES = {
     "m2 was stopped by the experimenter at 58.2 s": {
@@ -42,8 +42,8 @@ def test_a_change_is_a_sentence(sentence: str) -> None:
     assert Change(**table).describe("the experimenter") == sentence
     without = sentence.replace(" by the experimenter", "")
     assert Change(**table).describe() == without
-    assert describe_event(*event_of(table)) == without
-    assert describe_event(*event_of(table, sentence)) == sentence
+    assert Change.describe_event(*event_of(table)) == without
+    assert Change.describe_event(*event_of(table, sentence)) == sentence
 
 
 @pytest.mark.parametrize("order", [order for order in get_args(SiteOrder) if order])
@@ -59,13 +59,13 @@ def test_every_order_is_a_sentence(order: str) -> None:
 def test_the_source_of_a_stop_is_recovered() -> None:
     change = Change(at_s=58.2, site="m2", order="stop")
     for who in ("the experimenter", "the user of m1", "a watcher at a terminal"):
-        assert find_requester(change.describe(who)) == who
-    assert find_requester(change.describe()) == ""
-    assert find_requester("m2 follows its peers from t = 1.000 s") == ""
+        assert Change.find_requester(change.describe(who)) == who
+    assert Change.find_requester(change.describe()) == ""
+    assert Change.find_requester("m2 follows its peers from t = 1.000 s") == ""
 
 
 @pytest.mark.parametrize(
     "command", ["{", "{}", '{"at_s": "x"}', '{"at_s": 1.0, "link": "a->b"}', "[]", "3"]
 )
 def test_a_strangers_command_keeps_its_text(command: str) -> None:
-    assert describe_event("change", f"s takes in {command}", command)
+    assert Change.describe_event("change", f"s takes in {command}", command)

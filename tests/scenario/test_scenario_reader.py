@@ -19,7 +19,7 @@ from trilat_net.scenario import (
     parse_scenario,
     read_template,
 )
-from trilat_net.scenario.override import apply_overrides
+from trilat_net.scenario.override import ScenarioOverrides
 from trilat_net.scenario.scenario_reader import read_shipped
 
 
@@ -80,7 +80,7 @@ def test_an_override_reads_key_equals_value() -> None:
         'title="a = b"',
         "seed = 7",
     ]
-    apply_overrides(tables, texts)
+    ScenarioOverrides.parse(texts).apply_to(tables)
     assert tables == {
         "control": {"Kd": 5},
         "scheme": "digital",
@@ -149,7 +149,7 @@ def test_overrides_reach_list_entries_by_number() -> None:
     )
     assert resolved == stiff
     tables: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
-    apply_overrides(tables, ["a.0.b.1=5", "a.1.c=6"])
+    ScenarioOverrides.parse(["a.0.b.1=5", "a.1.c=6"]).apply_to(tables)
     assert tables == {"a": [{"b": [1, 5]}, {"c": 6}]}
 
 

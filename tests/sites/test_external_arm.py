@@ -42,7 +42,7 @@ from trilat_net.net.bus import Bus, StampingRing
 from trilat_net.net.messages import VERSION, Event, State
 from trilat_net.net.requests import ArmEnable, ArmMeasurement
 from trilat_net.net.wire import encode
-from trilat_net.presentation.page_sites import render_loops
+from trilat_net.presentation.page import render_report
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
@@ -296,7 +296,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
         return msgspec.structs.replace(state, late_us=1000 if state.tick in (7, 9) else 1)
 
     late = rewrite_log(log, change=delay)
-    page = render_loops(late, summarise_run(late))
+    page = render_report(late, None, [], summarise_run(late))
     assert "; 4 ticks began a period or more late and were executed nevertheless; " in page
     assert f"{skipped} ticks were skipped." in page
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.sites.sessions import make_gliding_scenario
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.link_summary import LinkSummary
 from trilat_net.errors import PeerLeft, SessionError
@@ -269,7 +269,7 @@ def test_certificates_of_left_sessions_judge_the_rest(tmp_path: Path) -> None:
     session.clocks["m1"].dies_ns = 4 * S
     session.site("m1", at_ns=5 * S)
     log = session.run()
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     premises = {premise.name: premise for premise in certificate.premises}
     assert premises["presence"].holds is False
     first, last = log.absences["m1"][0]

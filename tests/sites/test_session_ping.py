@@ -6,7 +6,7 @@ from tests.json_outline import is_documented
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Member, Party, answer_info
 from tests.net.waiting import sleep_for_ns
-from trilat_net.app.ros2_ping import measure_topic_delays
+from trilat_net.app.ros2_ping import TopicDelays
 from trilat_net.app.session_ping import GATHERING_NS
 from trilat_net.errors import RunFailed
 from trilat_net.net import topics
@@ -122,4 +122,4 @@ def test_silent_topics_are_reported() -> None:
             del topic, take
 
     with pytest.raises(RunFailed, match="no publisher sent a message on /chatter in 1 s"):
-        measure_topic_delays(Silent(), ManualClock(), "chatter", 1.0, lambda: False)  # type: ignore[arg-type]
+        TopicDelays.measure(Silent(), ManualClock(), "chatter", 1.0, lambda: False)  # type: ignore[arg-type]

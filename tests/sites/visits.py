@@ -6,7 +6,7 @@ from functools import partial
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Party
 from tests.net.waiting import sleep_for_ns
-from trilat_net.app.ros2_ping import TopicDelays, measure_topic_delays
+from trilat_net.app.ros2_ping import TopicDelays
 from trilat_net.app.session_ping import PingReport, SessionPing
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
@@ -78,4 +78,4 @@ def ping_publishers(lasts_s: float = 2.0) -> TopicDelays:
     graph = Publishers()
     clock = ManualClock(0, 10**18)
     stopped = partial(graph.publish, clock)
-    return measure_topic_delays(graph, clock, "chatter", lasts_s, stopped)  # type: ignore[arg-type]
+    return TopicDelays.measure(graph, clock, "chatter", lasts_s, stopped)  # type: ignore[arg-type]

@@ -11,23 +11,17 @@ from typing import Any
 import pytest
 
 from trilat_net.errors import RunFailed, UsageError
-from trilat_net.work.executor import (
-    MAX_LOSSES,
-    WorkerPool,
-    _Feed,
-    count_workers,
-    open_worker_pool,
-)
+from trilat_net.work.executor import MAX_LOSSES, WorkerPool, _Feed
 
 
 def test_any_executor_gives_the_results_of_this_process() -> None:
     progress: list[tuple[int, int]] = []
-    with ThreadPoolExecutor(3) as threads, open_worker_pool(None, threads) as pool:
+    with ThreadPoolExecutor(3) as threads, WorkerPool.open(None, threads) as pool:
         assert pool.map(abs, range(-50, 0), lambda *counts: progress.append(counts)) == list(
             range(50, 0, -1)
         )
     assert progress == [(n, 50) for n in range(1, 51)]
-    with open_worker_pool(1) as pool:
+    with WorkerPool.open(1) as pool:
         assert list(pool.iterate_results(abs, [-3, 2])) == [(0, 3), (1, 2)]
 
 
@@ -39,7 +33,7 @@ def test_few_items_are_taken_at_a_time() -> None:
             taken.append(n)
             yield n
 
-    with ThreadPoolExecutor(2) as threads, open_worker_pool(None, threads) as pool:
+    with ThreadPoolExecutor(2) as threads, WorkerPool.open(None, threads) as pool:
         results = pool.iterate_results(abs, items())
         seen = [next(results) for _ in range(20)]
         results.close()  # type: ignore[attr-defined]
@@ -103,7 +97,7 @@ class FragileExecutor(Executor):
 
 
 def test_items_of_a_lost_worker_run_again(tmp_path: Path) -> None:
-    with open_worker_pool(2) as pool:
+    with WorkerPool.open(2) as pool:
         assert pool.map(partial(killed_once, tmp_path / "flag"), range(30)) == [
             n * n for n in range(30)
         ]
@@ -119,9 +113,9 @@ def test_an_item_that_ends_every_worker_is_named() -> None:
 
 
 def test_jobs_belong_to_this_machine() -> None:
-    assert count_workers(3) == 3
+    assert WorkerPool.count_workers(3) == 3
     with pytest.raises(UsageError, match="jobs"):
-        count_workers(3, "tcp://127.0.0.1:1")
+        WorkerPool.count_workers(3, "tcp://127.0.0.1:1")
 
 
 def compute_together(items: Sequence[int]) -> Any:

@@ -11,10 +11,8 @@ from scipy.special import lambertw
 from tests.theory.loops import compute_residual, make_loop, roots_within
 from trilat_net.analysis.theory import characteristic_roots
 from trilat_net.analysis.theory.characteristic_roots import (
+    ChebyshevGrid,
     Spectrum,
-    chebyshev_differentiation,
-    chebyshev_interpolation,
-    chebyshev_nodes,
 )
 
 
@@ -123,8 +121,9 @@ def test_an_unheld_mass_drifts() -> None:
 
 @given(order=st.integers(3, 30), at=st.floats(-1, 1))
 def test_polynomials_are_differentiated_and_interpolated_exactly(order: int, at: float) -> None:
-    nodes = chebyshev_nodes(order)
-    assert chebyshev_differentiation(order) @ nodes**3 == pytest.approx(3 * nodes**2, abs=1e-10)
-    assert chebyshev_interpolation(order, np.array([at])) @ nodes**3 == pytest.approx(
+    grid = ChebyshevGrid(order)
+    nodes = grid.nodes
+    assert grid.build_differentiation() @ nodes**3 == pytest.approx(3 * nodes**2, abs=1e-10)
+    assert grid.build_interpolation(np.array([at])) @ nodes**3 == pytest.approx(
         at**3, abs=1e-12
     )

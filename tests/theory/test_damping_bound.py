@@ -20,7 +20,6 @@ from trilat_net.laws.conditions import (
     StabilityCondition,
 )
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.describe import describe_law_conditions
 
 LAB = [[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]]
 """The lab sheet's first exercise: 0.1 0.2 0.8 = 0.016 along the circle, 0.9 0.2 0.8 = 0.144 back."""
@@ -268,9 +267,9 @@ def test_springs_need_exact_gravity_everywhere(law: str) -> None:
     alike = load_scenario("two_sites", {**settings, "sites.m.control": control})
     lighter = {**control, "gravity": 0.9}
     unlike = load_scenario("two_sites", {**settings, "sites.m.control": lighter})
-    (line,) = describe_law_conditions(alike)
+    (line,) = alike.describe_law_conditions()
     assert line.startswith(f"condition of {law} at m, s holds")
-    (line,) = describe_law_conditions(unlike)
+    (line,) = unlike.describe_law_conditions()
     assert line.startswith(f"condition of {law} at s is undecided: known for gravity = 1")
 
 
@@ -381,6 +380,6 @@ def test_springs_between_end_effectors_have_no_known_bound() -> None:
             "sites.s.q0_rad": [0.3, 1.3],
         },
     )
-    (condition,) = describe_law_conditions(scenario)
+    (condition,) = scenario.describe_law_conditions()
     assert "is undecided: known only for joints that follow joints" in condition
     assert list_law_proofs(scenario) == []

@@ -13,7 +13,6 @@ from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.delay_margin import (
     MAX_COMMON_DELAY_S,
     DelayMargin,
-    set_common_delay,
 )
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
@@ -49,12 +48,12 @@ def test_oscillators_have_several_stable_delay_windows() -> None:
     assert margin.intervals[0].low is None
     for span in margin.intervals:
         inside = 0.5 * (span.low_s + span.high_s)
-        assert Spectrum.of_loop(set_common_delay(system, inside), 1).verdict == "stable"
+        assert Spectrum.of_loop(system.set_common_delay(inside), 1).verdict == "stable"
         if span.high is not None:
-            root = Spectrum.of_loop(set_common_delay(system, span.high_s), 1).roots[0]
+            root = Spectrum.of_loop(system.set_common_delay(span.high_s), 1).roots[0]
             assert abs(root.s - 1j * span.high.omega_rad_s) < 1e-8
             assert (
-                Spectrum.of_loop(set_common_delay(system, 1.001 * span.high_s), 1).verdict
+                Spectrum.of_loop(system.set_common_delay(1.001 * span.high_s), 1).verdict
                 == "unstable"
             )
 
@@ -82,7 +81,7 @@ def test_verdicts_over_delay_are_the_roots(seed: int) -> None:
         if all(abs(T - end) > 0.01 for end in ends if 0 < end < MAX_COMMON_DELAY_S):
             inside = any(span.low_s <= T <= span.high_s for span in margin.intervals)
             assert (
-                Spectrum.of_loop(set_common_delay(system, T), 1).verdict == "stable"
+                Spectrum.of_loop(system.set_common_delay(T), 1).verdict == "stable"
             ) == inside
 
 

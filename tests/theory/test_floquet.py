@@ -20,7 +20,6 @@ from trilat_net.analysis.theory.floquet import (
 )
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.sample_uses import draw_used_samples
 
 POSE = (0.1, 0.4)
 
@@ -260,7 +259,7 @@ def test_the_period_is_that_of_the_draws(period_s: float) -> None:
     assert uses.period_s is not None
     for (i, j), (link, key) in conditions.links.items():
         own_hz, peer_hz = (conditions.sites[n].rate_hz for n in (i, j))
-        drawn = draw_used_samples(link, key, own_hz, peer_hz, 3.0 + 2.0 * uses.period_s)[
+        drawn = link.draw_used_samples(key, own_hz, peer_hz, 3.0 + 2.0 * uses.period_s)[
             3 * own_hz :
         ]
         later = drawn[round(uses.period_s * own_hz) :] - round(uses.period_s * peer_hz)

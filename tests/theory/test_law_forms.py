@@ -23,7 +23,6 @@ from tests.transmission import (
 )
 from tests.unit_arm import CLAMP, make_four_channel_pair, make_spring_hand, make_unit_scenario
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
-from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.analysis.theory.linear_loop import LinearLoop
@@ -186,7 +185,7 @@ def test_six_channels_with_accelerations_share_as_published(
         "s": {"hands": [make_spring_hand(0.0, 500.0, 5.0)]},
     }
     law = {"law": "six_channel", "K": 100.0, "B": 20.0, "acceleration": 1.0}
-    loop = set_common_delay(loop_of(make_unit_scenario(sites, law, dominance=shares)), 0.0)
+    loop = loop_of(make_unit_scenario(sites, law, dominance=shares)).set_common_delay(0.0)
     ratios = [
         abs(find_impedance(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
         for hz in (0.1, 1.0)

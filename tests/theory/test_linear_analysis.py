@@ -15,16 +15,15 @@ from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
 from trilat_net.analysis.theory.loop_roots import find_log_roots
 from trilat_net.errors import UsageError
 from trilat_net.presentation.figures.linear_figures import draw_root_map
-from trilat_net.presentation.linear_text import (
-    describe_effective_delays,
-    describe_equilibrium,
-    describe_linear_verdict,
-    describe_zero_roots,
-    tabulate_roots,
-)
+from trilat_net.presentation.result_text import TextTable, compose
 from trilat_net.scenario import load_scenario
 
 POSE = (-0.1729, 0.0874)
+
+
+def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
+    (table,) = (block for block in compose(analysis) if isinstance(block, TextTable))
+    return table
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +46,7 @@ def test_above_the_edge_a_margin_remains(calm: LinearAnalysis) -> None:
 def test_less_damping_than_the_edge_is_unstable() -> None:
     analysis = analyse_linear_loop("p_d_margin", ["control.d=0.9"], pose=(0.07, 0.23))
     assert analysis.verdict == "unstable"
-    assert describe_linear_verdict(analysis).startswith(
-        "unstable: the slowest motion goes as exp(0.01"
-    )
+    assert "\nunstable: the slowest motion goes as exp(0.01" in str(analysis)
 
 
 def test_verdicts_follow_the_computed_loop(digital: LinearAnalysis) -> None:
@@ -77,8 +74,10 @@ def test_every_word_has_its_number(calm: LinearAnalysis) -> None:
         f"{first['im_rad_s']:.4g}",
     )
     assert facts["margin"]["words"] in str(calm)
-    assert str(facts["continuous"]["zeros_by_structure"]) in describe_zero_roots(calm)
-    assert list(describe_equilibrium(calm))[1].strip() == "all sites at (0.0700, 0.2300) rad"
+    zero_count = facts["continuous"]["zeros_by_structure"]
+    lines = str(calm).splitlines()
+    assert any(line.startswith(f"{zero_count} roots are zero by structure: ") for line in lines)
+    assert lines[1].strip() == "all sites at (0.0700, 0.2300) rad"
     json.dumps(facts, allow_nan=False)
 
 
@@ -97,10 +96,11 @@ def test_several_rates_have_roots_over_periods() -> None:
     pair = load_scenario(load_scenario("two_sites", control), settings)
     analysis = analyse_linear_loop(pair, pose=(0.0, math.pi))
     assert (analysis.continuous.verdict, analysis.verdict) == ("stable", "unstable")
-    assert describe_linear_verdict(analysis) == (
+    verdict = (
         "unstable: the slowest motion goes as exp(0.1802 t / s) at 9.955 rad/s, as computed over the period "
         "of 0.1 s"
     )
+    assert verdict in str(analysis).splitlines()
     assert any("ticks and delays decide" in note for note in analysis.notes)
     assert tabulate_roots(analysis).rows[0][0] == "0.1802"
     facts = analysis.to_dict()
@@ -113,8 +113,9 @@ def test_drawn_delays_state_their_roots_accuracy() -> None:
     assert analysis.sampled is not None
     assert analysis.sampled.deviation_per_s is not None
     phrase = f"over 30 s of the delays in use, +- {analysis.sampled.deviation_per_s:.1g} /s"
-    assert describe_linear_verdict(analysis).endswith(phrase)
-    assert "mean delay in use on m2->m1" in "".join(describe_effective_delays(analysis))
+    text = str(analysis)
+    assert any(line.endswith(phrase) for line in text.splitlines())
+    assert "mean delay in use on m2->m1" in text
 
 
 def test_lasting_motions_are_separated_from_decaying() -> None:
@@ -123,9 +124,9 @@ def test_lasting_motions_are_separated_from_decaying() -> None:
     analysis = analyse_linear_loop(
         "two_sites", {"scheme": "digital", "control": control}, pose=POSE
     )
-    text = describe_linear_verdict(analysis)
-    assert text.startswith(
-        "at the edge: 2 motions keep their speed, and the slowest of the other motions goes as exp(-0."
+    assert (
+        "\nat the edge: 2 motions keep their speed, and the slowest of the other motions goes as exp(-0."
+        in str(analysis)
     )
 
 

@@ -15,7 +15,6 @@ from tests.scenario.builders import two_arm_text
 from tests.theory.loops import Array, compute_residual, roots_within
 from trilat_net.analysis.theory import find_equilibrium, iterate_linear_edges
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
-from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import predict_equilibrium
 from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
 from trilat_net.analysis.theory.linear_loop import LinearLoop
@@ -178,7 +177,7 @@ def test_learnt_gravity_stands_for_all_estimates() -> None:
         f"{site}.gravity{joint}" for site in "ms" for joint in LOADED
     ]
     assert short.omitted_states == 2 * (60 - len(LOADED)) == len(whole.names) - len(short.names)
-    values = [eigvals(set_common_delay(loop, 0.0).A) for loop in (whole, short)]
+    values = [eigvals(loop.set_common_delay(0.0).A) for loop in (whole, short)]
     moving = [np.sort_complex(np.round(value[np.abs(value) > 1e-4], 7)) for value in values]
     assert len(moving[0]) == len(moving[1])
     assert np.abs(moving[0] - moving[1]).max() <= 1e-6

@@ -23,7 +23,6 @@ from trilat_net.analysis.theory.linear_edge import (
     ASSUMED_EQUILIBRIUM_REMARK,
     GrowthColumn,
     LinearEdge,
-    find_root_crossings,
 )
 from trilat_net.core.arms.two_link_arm import inertia
 from trilat_net.errors import ScenarioError, UsageError
@@ -189,7 +188,9 @@ def test_the_real_part_is_that_of_the_analysis() -> None:
 
 @pytest.mark.long
 def test_an_edge_is_where_the_sign_changes() -> None:
-    (crossing,), remark = find_root_crossings(make_damped_scenario(3.0), "control.d", 0.3, 3.0)
+    (crossing,), remark = GrowthColumn.find_crossings(
+        make_damped_scenario(3.0), "control.d", 0.3, 3.0
+    )
     assert remark == ""
     places = (crossing - 1e-4, crossing + 1e-4)
     (below, above), edges, *_ = GrowthColumn.compute(
@@ -225,6 +226,6 @@ def test_nonlinear_loops_are_reported_as_unknown() -> None:
     assert growth_rates[1] < 0.0
     assert len(remarks) == 1
     assert remarks[0].startswith("no linear analysis: ")
-    crossings, remark = find_root_crossings(unknown, "control.d", 0.3, 3.0)
+    crossings, remark = GrowthColumn.find_crossings(unknown, "control.d", 0.3, 3.0)
     assert crossings == ()
     assert remark.startswith("no linear analysis: ")

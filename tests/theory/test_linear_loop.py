@@ -10,7 +10,6 @@ from tests.execution.builders import make_trajectories, run_fused
 from tests.theory.loops import RODS
 from trilat_net.analysis.theory import analyse_linear_loop, find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
-from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import follow_equilibrium
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
@@ -106,9 +105,9 @@ def test_zero_delay_is_the_one_tick_limit() -> None:
         OperatingConditions.derive(scenario), find_equilibrium(scenario, POSE)
     )
     tick, none = (
-        Spectrum.of_loop(set_common_delay(linear_loop, T), 1).roots[0].s for T in (1e-3, 0.0)
+        Spectrum.of_loop(linear_loop.set_common_delay(T), 1).roots[0].s for T in (1e-3, 0.0)
     )
-    tenth = Spectrum.of_loop(set_common_delay(linear_loop, 1e-4), 1).roots[0].s
+    tenth = Spectrum.of_loop(linear_loop.set_common_delay(1e-4), 1).roots[0].s
     assert abs(tick - none) < 0.05
     assert abs(tenth - none) == pytest.approx(0.1 * abs(tick - none), rel=0.1)
 

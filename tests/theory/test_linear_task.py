@@ -15,7 +15,6 @@ from trilat_net.analysis.theory import (
     iterate_linear_edges,
 )
 from trilat_net.analysis.theory.characteristic_roots import Spectrum, find_moving_part
-from trilat_net.analysis.theory.delay_margin import set_common_delay
 from trilat_net.analysis.theory.equilibrium import find_mean_pose
 from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
 from trilat_net.analysis.theory.linear_loop import LinearLoop
@@ -265,7 +264,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     analysis = analyse_linear_loop(scenario, pose=pose)
     end = analysis.margin.intervals[0].high
     assert end is not None
-    rightmost = Spectrum.of_loop(set_common_delay(analysis.loop, end.delay_s), 1).rightmost
+    rightmost = Spectrum.of_loop(analysis.loop.set_common_delay(end.delay_s), 1).rightmost
     assert rightmost is not None
     assert rightmost.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
     edge = next(

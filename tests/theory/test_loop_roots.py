@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import trilat_net as tn
 from tests.execution.builders import make_log_with_commands, run_fused
-from trilat_net.analysis.delay_period import find_burst_interval_s, find_final_delay_period
+from trilat_net.analysis.delay_period import DelayPeriod, find_burst_interval_s
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import RunEnd
 from trilat_net.analysis.theory.loop_roots import (
@@ -81,7 +81,7 @@ def test_common_period_is_the_least_common_multiple(periods: list[int], rate_hz:
         f"links.{link}": make_sine_overrides(period / 1000.0)
         for link, period in zip(("m->s", "s->m"), periods, strict=False)
     }
-    period = find_final_delay_period(make_pair_scenario(rate_hz=rate_hz, **links))
+    period = DelayPeriod.of_scenario(make_pair_scenario(rate_hz=rate_hz, **links))
     tick = Fraction(1, rate_hz)
     cycles = [Fraction(ms, 1000) for ms in periods]
     smallest = next(
@@ -100,7 +100,7 @@ def test_common_period_is_the_least_common_multiple(periods: list[int], rate_hz:
     ],
 )
 def test_random_delays_have_no_period(link: dict[str, Any]) -> None:
-    assert find_final_delay_period(make_pair_scenario(link=link)).true_s is None
+    assert DelayPeriod.of_scenario(make_pair_scenario(link=link)).true_s is None
 
 
 def test_bursts_are_spaced_by_their_losses() -> None:

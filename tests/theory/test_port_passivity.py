@@ -17,7 +17,6 @@ from trilat_net.analysis.theory.port_passivity import (
 from trilat_net.analysis.theory.port_response import (
     build_admittance,
     clamp_site,
-    find_longest_delay_s,
 )
 from trilat_net.errors import UsageError
 
@@ -27,9 +26,7 @@ OR_NONE = st.just(0.0) | POSITIVE
 
 def judge_passivity(network: Network, weights: tuple[float, ...] | None = None) -> Passivity:
     Y = build_admittance(network.loop)
-    w = refine_frequencies(
-        Y, build_frequency_grid(1e-3, 10.0, find_longest_delay_s(network.loop))
-    )
+    w = refine_frequencies(Y, build_frequency_grid(1e-3, 10.0, network.loop.longest_delay_s))
     return Passivity.check(Y, w, None if weights is None else np.array(weights))
 
 

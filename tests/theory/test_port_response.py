@@ -10,7 +10,6 @@ from trilat_net.analysis.theory.port_response import (
     Transparency,
     build_admittance,
     evaluate_transfer,
-    find_longest_delay_s,
     find_site_ports,
     group_ports_by_joint,
     list_port_sites,
@@ -121,8 +120,8 @@ def test_ports_by_site_and_by_joint() -> None:
     assert find_site_ports(loop, "a") == [0, 1]
     assert group_ports_by_joint(loop) == {1: [0], 2: [1]}
     assert group_ports_by_joint(make_pair().loop) == {1: [0, 1]}
-    assert find_longest_delay_s(make_pair(T=(0.1, 0.4)).loop) == 0.4
-    assert find_longest_delay_s(Network((1.0,), (0.0,), (0.0,)).loop) == 0.0
+    assert make_pair(T=(0.1, 0.4)).loop.longest_delay_s == 0.4
+    assert Network((1.0,), (0.0,), (0.0,)).loop.longest_delay_s == 0.0
     Y = build_admittance(loop)
     np.testing.assert_array_equal(select_ports(Y, [1])(W), Y(W)[:, 1:, 1:])
 

@@ -20,7 +20,6 @@ from trilat_net.analysis.theory.port_response import (
     build_admittance,
     clamp_site,
     evaluate_transfer,
-    find_longest_delay_s,
     find_site_ports,
     list_port_sites,
     parse_port_site,
@@ -48,7 +47,7 @@ def linearise_at_pose(
 
 
 def build_grid(loop: LinearLoop) -> np.ndarray:
-    delay_s = find_longest_delay_s(loop)
+    delay_s = loop.longest_delay_s
     return refine_frequencies(
         build_admittance(loop), build_frequency_grid(1e-3, 100.0, delay_s)
     )

@@ -1,11 +1,11 @@
-"""Computes results from the log of a run: delays, events, metrics and a stability judgement.
+"""Computes delays, events, metrics and a stability verdict from the log of a run.
 
-A log is the file that a run leaves behind. It has a record of the state of every arm for each
-period of the control loop. For example, `metrics` computes the RMS tracking error of an arm
-from these records, and `certificate` judges whether the run was stable.
+A log contains one record per site and tick. For example, `metrics` computes the RMS tracking
+error of an arm from these records, and `certificate` judges whether the run was stable.
 
 Invariant:
-    - Nothing in this package draws, formats or prints. The package `presentation` does so.
+    - Nothing in this package draws, formats or prints. That is the task of the package
+      `presentation`.
 """
 
 from typing import TYPE_CHECKING
@@ -23,7 +23,6 @@ __all__ = [
     "Stability",
     "certify_run",
     "decision_facts",
-    "find_hanging_sites",
     "judge_virtual_run",
     "run_remarks",
     # The certificate
@@ -34,23 +33,20 @@ __all__ = [
     "ObservedEnergy",
     "ObservedFinding",
     "RunningEnergy",
-    "certify_log",
     "premise_quantities",
     "verdict_facts",
     # Twins
     "MOST_LOG",
+    "EnvelopeFit",
     "EnvelopeTrend",
     "PushGrowth",
     "PushedTwins",
     "TwinGrowth",
-    "fit_envelopes",
-    "measure_amplitude",
     "twin",
     # Metrics
     "LogMetrics",
     "Metric",
     "Quantity",
-    "measure_undelayed_error",
     # The linearised loop
     "MAX_COMMON_DELAY_S",
     "QUOTED_AT_HZ",
@@ -60,34 +56,25 @@ __all__ = [
     "RestingLoop",
     "Passivity",
     "PortAnalysis",
-    "TwoPort",
     "analyse_linear_loop",
-    "find_root_crossings",
     "find_run_roots",
-    "read_hands",
     # Signals of a run
     "SETTLED_ERROR_RAD",
     "AlignedRecords",
-    "BodyTurns",
     "Bools",
     "JointError",
-    "PlacedArm",
-    "RunView",
     "TorqueSplit",
     "build_arm_rows",
     "SourceRows",
-    "joint_positions_m",
     "largest_magnitude",
     "VirtualWall",
     "settling_time_of_all_s",
     "site_signals",
-    "upright_axes",
     # Links, leaders and events
     "DelayDistribution",
     "FileOverview",
     "info",
     "link_summary",
-    "DominancePlan",
     "SharedSlave",
     "Timeline",
     "summarise_run",
@@ -97,21 +84,18 @@ __all__ = [
 if TYPE_CHECKING:
     from . import decision_facts, link_summary, run_remarks, site_signals
     from .aligned import AlignedRecords, Bools
-    from .arm_rows import PlacedArm, build_arm_rows, joint_positions_m, upright_axes
-    from .body_turns import BodyTurns
+    from .arm_rows import build_arm_rows
     from .certificate import premise_quantities, verdict_facts
-    from .certificate.certificate_result import Certificate
     from .certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
     from .certificate.observed_energy import ObservedEnergy, ObservedFinding
     from .certificate.running_energy import KEPT_S, RunningEnergy
-    from .certificate.stability_certificate import certify_log
-    from .dominance_history import DominanceHistory, DominancePlan
+    from .certificate.stability_certificate import Certificate
+    from .dominance_history import DominanceHistory
     from .file_overview import FileOverview, info, summarise_run
     from .judge import certify_run, judge_virtual_run
     from .link_summary import DelayDistribution
     from .metrics.log_metrics import LogMetrics
     from .metrics.measures import Metric, Quantity
-    from .metrics.motion_metrics import measure_undelayed_error
     from .run_end import (
         FORCE_NM,
         NO_BUCKETS,
@@ -120,9 +104,7 @@ if TYPE_CHECKING:
         RunEnd,
         RunTrace,
         Stability,
-        find_hanging_sites,
     )
-    from .run_view import RunView
     from .shared_slave import SharedSlave
     from .site_signals import (
         SETTLED_ERROR_RAD,
@@ -132,23 +114,21 @@ if TYPE_CHECKING:
     )
     from .theory.characteristic_roots import Complex
     from .theory.delay_margin import MAX_COMMON_DELAY_S
-    from .theory.hand_files import read_hands
     from .theory.linear_analysis import LinearAnalysis, analyse_linear_loop
-    from .theory.linear_edge import GrowthColumn, find_root_crossings
+    from .theory.linear_edge import GrowthColumn
     from .theory.loop_roots import find_run_roots
-    from .theory.port_analysis import PortAnalysis, TwoPort
+    from .theory.port_analysis import PortAnalysis
     from .theory.port_passivity import Passivity
     from .theory.port_response import QUOTED_AT_HZ
     from .theory.resting_loop import RestingLoop
     from .timeline import Timeline
     from .torque_sources import SourceRows, TorqueSplit, VirtualWall
-    from .twins.envelope_trend import EnvelopeTrend, fit_envelopes
+    from .twins.envelope_trend import EnvelopeFit, EnvelopeTrend
     from .twins.twin_growth import (
         MOST_LOG,
         PushedTwins,
         PushGrowth,
         TwinGrowth,
-        measure_amplitude,
         twin,
     )
 else:
@@ -156,29 +136,22 @@ else:
         __name__,
         {
             "aligned": "AlignedRecords Bools",
-            "arm_rows": "PlacedArm build_arm_rows joint_positions_m upright_axes",
-            "body_turns": "BodyTurns",
-            "certificate.certificate_result": "Certificate",
+            "arm_rows": "build_arm_rows",
             "certificate.energy_balance": "EnergyBalance ZERO_ENERGY_J",
             "certificate.observed_energy": "ObservedEnergy ObservedFinding",
             "certificate.premise_quantities": "premise_quantities",
             "certificate.running_energy": "KEPT_S RunningEnergy",
-            "certificate.stability_certificate": "certify_log",
+            "certificate.stability_certificate": "Certificate",
             "certificate.verdict_facts": "verdict_facts",
             "decision_facts": "decision_facts",
-            "dominance_history": "DominanceHistory DominancePlan",
+            "dominance_history": "DominanceHistory",
             "file_overview": "FileOverview info summarise_run",
             "judge": "certify_run judge_virtual_run",
             "link_summary": "DelayDistribution link_summary",
             "metrics.log_metrics": "LogMetrics",
             "metrics.measures": "Metric Quantity",
-            "metrics.motion_metrics": "measure_undelayed_error",
-            "run_end": (
-                "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD "
-                "find_hanging_sites"
-            ),
+            "run_end": "EndBehaviour FORCE_NM NO_BUCKETS RunEnd RunTrace Stability THROWN_RAD",
             "run_remarks": "run_remarks",
-            "run_view": "RunView",
             "shared_slave": "SharedSlave",
             "site_signals": (
                 "JointError SETTLED_ERROR_RAD largest_magnitude settling_time_of_all_s "
@@ -186,19 +159,16 @@ else:
             ),
             "theory.characteristic_roots": "Complex",
             "theory.delay_margin": "MAX_COMMON_DELAY_S",
-            "theory.hand_files": "read_hands",
             "theory.linear_analysis": "LinearAnalysis analyse_linear_loop",
-            "theory.linear_edge": "GrowthColumn find_root_crossings",
+            "theory.linear_edge": "GrowthColumn",
             "theory.loop_roots": "find_run_roots",
-            "theory.port_analysis": "PortAnalysis TwoPort",
+            "theory.port_analysis": "PortAnalysis",
             "theory.port_passivity": "Passivity",
             "theory.port_response": "QUOTED_AT_HZ",
             "theory.resting_loop": "RestingLoop",
             "timeline": "Timeline",
             "torque_sources": "SourceRows TorqueSplit VirtualWall",
-            "twins.envelope_trend": "EnvelopeTrend fit_envelopes",
-            "twins.twin_growth": (
-                "MOST_LOG PushGrowth PushedTwins TwinGrowth measure_amplitude twin"
-            ),
+            "twins.envelope_trend": "EnvelopeFit EnvelopeTrend",
+            "twins.twin_growth": ("MOST_LOG PushGrowth PushedTwins TwinGrowth twin"),
         },
     )

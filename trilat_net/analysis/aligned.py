@@ -1,16 +1,16 @@
-"""Aligns the recorded motion of an arm with the delayed motion of the arms that it follows.
+"""Aligns the recorded motion of an arm with the delayed motion of its peers.
 
-A controller uses the state that another arm sent some time ago. Sums of energies therefore need
-the motion of that arm at the time of sending, which usually lies between two of its records.
-They also need every period of the control loop (tick), although a log may lack some records.
-`AlignedRecords.by_site` gives one row of numbers per tick of an arm. `PeerTrajectory` gives the
-motion of an arm at any time, and `DelayedPeer` the motion that another arm used.
+A controller uses the state that a peer sent some time ago. Energy sums therefore need the
+motion of the peer at the time of sending, which usually lies between two of its records. They
+also need every tick, although a log may lack some records. `AlignedRecords.by_site` returns
+arrays with one row per tick of an arm. `PeerTrajectory` interpolates the motion of an arm at
+any time, and `DelayedPeer` holds the motion that another arm used.
 
 Invariant:
-    - A missing record is interpolated, so that sums have all their terms. Such a row is not
-      marked as `known`, and no metric uses it.
+    - Missing records are interpolated to keep the sums complete. Interpolated rows are not
+      marked as `known`, and no metric uses them.
     - Between two records, an arm moves along a cubic polynomial that matches the recorded
-      angles and velocities. Before its first record it does not move.
+      angles and velocities. Before its first record it is at rest.
     - Within a tick, the delay of the used state is constant, as the stability theorem assumes.
       The difference from the next state is a jump at the end of the tick.
 """
@@ -39,21 +39,19 @@ _TICK_TOLERANCE = 1e-5
 
 
 class AlignedRecords(NamedTuple):
-    """A site's records over K successive ticks, with one row for every tick.
+    """The records of one site over K consecutive ticks, with one row per tick.
 
-    A site is a process that runs one arm. It stores one record per tick, the period of its
-    control loop. Rows of ticks without a record are interpolated, so that all arrays are
-    complete. The arm has n joints. In task space the sites share the m coordinates of their end
-    effectors instead of their joint angles.
+    Rows of ticks without a record are interpolated, so all arrays are complete. The arm has n
+    joints. In task space the sites share the m coordinates of their end effectors instead of
+    their joint angles.
 
     Attributes:
         site: Name of the site.
         rate_hz: Tick rate, in Hz.
         first: Number of the tick in row 0.
         known: True if the tick has a record, False if the row is interpolated, shape (K,).
-        follows: True if the site followed its peers, the sites whose motion it receives, shape
-            (K,). In these rows the site did not hold, brake or return, and its reference was
-            slower than its limit.
+        follows: True if the site followed its peers, shape (K,). In these rows the site did not
+            hold, brake or return, and its reference was slower than its limit.
         q: Joint angles, shape (K, n), in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
         q_des: Reference of the shared coordinates, shape (K, n) in rad, or (K, m) in task
@@ -99,34 +97,31 @@ class AlignedRecords(NamedTuple):
 
     @property
     def shared(self) -> Array:
-        """Coordinates in which the sites follow each other, one row per tick.
+        """The coordinates that the site sends to its peers, one row per tick.
 
-        A site sends them to its peers. They are the joint angles q, shape (K, n), in rad, or in
-        task space the pose x of the end effector, shape (K, m).
+        These are the joint angles q, shape (K, n), in rad, or in task space the pose x of the
+        end effector, shape (K, m).
         """
         return self.x if self.x.size else self.q
 
     @property
     def shared_rate(self) -> Array:
-        """Velocity of the coordinates in which the sites follow each other, one row per tick.
+        """The time derivative of the shared coordinates, one row per tick.
 
-        Sites follow each other's joint angles, or in task space the positions of their end
-        effectors. The velocity is qd, shape (K, n), in rad/s, or in task space xd, shape (K,
-        m).
+        In joint space this is qd, shape (K, n), in rad/s, and in task space xd, shape (K, m).
         """
         return self.xd if self.x.size else self.qd
 
     @property
     def h_s(self) -> float:
-        """The period of the control loop (tick), in s: 0.001 at a rate of 1 kHz."""
+        """Tick period, in s: 0.001 at a rate of 1 kHz."""
         return 1.0 / self.rate_hz
 
     @property
     def t_s(self) -> Array:
         """Nominal time of every row, tick / rate_hz, shape (K,), in s.
 
-        A tick is a period of the control loop. A tick that was computed late has the same
-        nominal time.
+        A tick that was computed late keeps its nominal time.
         """
         return self._ticks / self.rate_hz
 
@@ -138,21 +133,20 @@ class AlignedRecords(NamedTuple):
 
     @property
     def nominal_s(self) -> Array:
-        """Planned time of the tick in every row, rounded down to whole nanoseconds.
+        """Scheduled time of the tick in every row, rounded down to whole nanoseconds.
 
         The shape is (K,), in s. The simulation compares exactly these times with the start and
-        the end of an external torque. `t_s` is not rounded, and may differ in the last digit.
+        end of an external torque. The times in `t_s` are not rounded and may differ in the last
+        digit.
         """
         time_ns = self._ticks * NS_PER_S // self.rate_hz
         return time_ns.astype(np.float64) * 1e-9
 
     @property
     def e(self) -> Array:
-        """The synchronisation error of the site, which is its position minus its reference.
+        """Synchronisation error of the site: its position minus its reference.
 
-        The reference is the position that the site follows. If sites follow each other joint by
-        joint, the error has the shape (K, n) for n joints, in rad. In task space, where they
-        follow with their end effectors, it has the shape (K, m) for m coordinates.
+        The shape is (K, n) in joint space, in rad, and (K, m) in task space.
         """
         if self.x.size:
             return compute_task_errors(self.x, self.q_des, self.axes)
@@ -160,37 +154,34 @@ class AlignedRecords(NamedTuple):
 
     @property
     def ed(self) -> Array:
-        """The derivative of the synchronisation error, which is the velocity error of the site.
+        """Time derivative of the synchronisation error: site velocity minus reference velocity.
 
-        It is the velocity of the site minus the velocity of its reference, which is the motion
-        that it follows. If sites follow each other joint by joint, the shape is (K, n) for n
-        joints, in rad/s. In task space, where they follow with their end effectors, it is (K,
-        m) for m coordinates.
+        The shape is (K, n) in joint space, in rad/s, and (K, m) in task space.
         """
         return self.shared_rate - self.qd_des
 
     @property
     def known_periods(self) -> Bools:
-        """Marks the tick periods that can be judged: both of their ticks have a record.
+        """Marks the tick periods that can be judged because both of their ticks have a record.
 
         Energy changes between two ticks. If the record of a tick was lost, the periods before
-        and after this tick are therefore unknown. K ticks bound K - 1 periods, so the shape is
-        (K - 1,).
+        and after it are therefore unknown. K ticks bound K - 1 periods, so the shape is (K -
+        1,).
         """
         is_known_at_start = self.known[:-1]
         is_known_at_end = self.known[1:]
         return is_known_at_start & is_known_at_end
 
     def known_at_end(self, length_s: float) -> Bools:
-        """Marks the rows in the last seconds of a run that were recorded, not interpolated.
+        """Marks the recorded (not interpolated) rows in the last seconds of a run.
 
-        Metrics of the end of a run, such as the last error, use these rows alone.
+        Metrics of the end of a run, such as the final error, use only these rows.
 
         Args:
             length_s: Length of the interval at the end of the records, in s.
 
         Returns:
-            True for each row that is in the interval and has a record, shape (K,).
+            True for each row in the interval that has a record, shape (K,).
         """
         t_s = self.t_s
         start_s = t_s[-1] - length_s
@@ -199,20 +190,19 @@ class AlignedRecords(NamedTuple):
 
     @classmethod
     def by_site(cls, log: Log, *, common: bool = False) -> "dict[str, AlignedRecords]":
-        """Arranges the records of all sites with one row per tick, so that they are comparable.
+        """Arranges the records of all sites into arrays with one row per tick.
 
-        A site is the process that runs one arm. Ticks without a record are interpolated. A last
-        record with the mode "diverged" is left out, because it may contain zeros in place of
-        numbers that are not finite.
+        Ticks without a record are interpolated. A final record with the mode "diverged" is left
+        out, because it may contain zeros in place of values that are not finite.
 
         Args:
             log: The log of the run.
-            common: True to end all sites where the first site ends, as sums over all sites
-                require.
+            common: True to cut all sites off where the shortest one ends, as sums over all
+                sites require.
 
         Returns:
-            The records by name of the site, in scenario order. Sites without records are
-            missing. With `common` the result is empty if any site has fewer than two ticks.
+            A mapping from site name to records, in scenario order. Sites without records are
+            missing. With `common`, the mapping is empty if any site has fewer than two ticks.
         """
         rows_by_site: dict[str, Ints] = {}
         for site in log.sites:
@@ -251,13 +241,13 @@ class AlignedRecords(NamedTuple):
         return aligned
 
     def view_delayed_peer(self, past: "PeerTrajectory") -> "DelayedPeer":
-        """Returns the motion of another arm as this arm received it, with the network delay.
+        """Returns the motion of a peer as this arm received it, including the network delay.
 
-        The records of this arm say which message was used in each tick (control period), and
-        the motion of the other arm says which state this message contained.
+        The records of this arm tell which sample was used in each tick, and the trajectory of
+        the peer gives the state in that sample.
 
         Args:
-            past: Motion of the peer over time.
+            past: Trajectory of the peer.
         """
         used = self.used[past.records.site]
         has_sample = used >= 0
@@ -274,17 +264,16 @@ class AlignedRecords(NamedTuple):
         )
 
     def find_latest_rows(self, t_s: Array) -> tuple[Ints, Bools]:
-        """Finds the last record of an arm at or before each of several times.
+        """Finds the latest row of this arm at or before each of the given times.
 
-        It relates arms whose control loops have different rates: a time of one arm is looked up
-        in the records of another arm.
+        Used to compare arms with different tick rates.
 
         Args:
             t_s: Times since the start of the session, shape (K,), in s.
 
         Returns:
-            For each time, the row of that tick, shape (K,). If the time is outside the records,
-            it is the nearest row.
+            For each time, the row of the latest tick, shape (K,). For a time outside the
+            records, this is the nearest row.
             For each time, True if that tick was recorded, and False if its row is interpolated
             or outside the records, shape (K,).
         """
@@ -299,10 +288,10 @@ class AlignedRecords(NamedTuple):
 
 
 def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
-    """Returns the torque that acts during every tick period, computed from recorded torques.
+    """Converts recorded torques to the torque that acts during each tick period.
 
-    Between two ticks the torque is constant. The scheme `digital` holds the torque tau_k of
-    tick k. The scheme `second_order` holds 1.5 tau_k - 0.5 tau_{k-1} instead, within the limit,
+    The torque is constant between two ticks. The scheme `digital` holds the torque tau_k of
+    tick k. The scheme `second_order` holds 1.5 tau_k - 0.5 tau_{k-1}, clipped to the limit,
     which approximates the torque in the middle of the period.
 
     Args:
@@ -436,9 +425,9 @@ class _PeerMotion(NamedTuple):
 class PeerTrajectory:
     """The motion of a site as a function of continuous time, interpolated from its records.
 
-    The trajectory gives the position of the site at the time of sending a sample, or between
-    two ticks. The motion is a polynomial between two records. Before the first record the arm
-    rests (assumption L7).
+    Used to evaluate the position of a site between two ticks, for example when it sent a
+    sample. The motion is a polynomial between two records. Before the first record the arm is
+    at rest (assumption L7).
 
     Args:
         records: Records of the site.
@@ -457,10 +446,10 @@ class PeerTrajectory:
     def evaluate(self, t_s: Array) -> _PeerMotion:
         """Returns the site's motion at the given times, interpolated between its records.
 
-        At the site's ticks the motion equals the records. Between two records, q is the cubic
-        polynomial that has the recorded angles and velocities at both ends (Hermite
-        interpolation), and qd is linear. The integral of qd squared is computed by the
-        trapezoid rule.
+        At the site's ticks, the motion equals the records. Between two records, q is the cubic
+        polynomial that matches the recorded angles and velocities at both ends (Hermite
+        interpolation), and qd is linear. The integral of qd squared is computed with the
+        trapezoidal rule.
 
         Args:
             t_s: Times after the start of the session, shape (K,), in s.
@@ -536,16 +525,15 @@ class PeerTrajectory:
 
 
 class DelayedPeer(NamedTuple):
-    """Motion of another arm (a peer), both as it is and as this arm receives it, with delay.
+    """The motion of a peer, both its actual motion and the delayed one that this arm receives.
 
-    In each of its K ticks (control periods) this arm uses one sample, a state that the peer
-    sent earlier.
+    In each of its K ticks, this arm uses one sample, which the peer sent earlier.
 
     Attributes:
         now: Motion of the peer at the site's ticks, K rows.
-        delayed: Motion of the peer at the times at which the samples in use were sent, K rows.
-        delayed_end: Motion of the peer at the end of every tick period, delayed as if the age
-            of the sample had not changed within the period, K - 1 rows.
+        delayed: Motion of the peer when the samples in use were sent, K rows.
+        delayed_end: Delayed motion of the peer at the end of every tick period, assuming that
+            the age of the sample did not change within the period, K - 1 rows.
         stamp_s: Time at which the sample in use was sent, shape (K,), in s. NaN before the
             first sample.
     """
@@ -557,10 +545,10 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """Marks the tick periods in which records alone determine the motion of the peer.
+        """Marks the tick periods in which the peer's motion is determined by records alone.
 
         Both its present and its delayed motion must be known. The other periods contain
-        interpolated records. Energies that depend on the peer are not judged there. K ticks
+        interpolated records, so energies that depend on the peer are not judged there. K ticks
         bound K - 1 periods, so the shape is (K - 1,).
         """
         now = self.now.known
@@ -576,17 +564,17 @@ _BEFORE_EPOCH_S = -1.0
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
-    """Finds the records at which several arms can be compared at the same time.
+    """Finds the rows at which several arms can be compared at the same time.
 
-    The times are the ticks (control periods) of the first arm. For each other arm, the row of
-    its latest tick at each time is returned, since the rates may differ.
+    The times are the ticks of the first arm. For every other arm, the row of its latest tick at
+    each of these times is returned, since the rates may differ.
 
     Args:
         sites: Records of the sites.
 
     Returns:
         The rows of each site, in the order of `sites`, shape (K,) each.
-        True at instants at which these ticks of all sites are recorded, shape (K,).
+        True where these ticks are recorded for all sites, shape (K,).
     """
     rows = []
     recorded_by_site = []

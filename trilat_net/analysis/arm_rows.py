@@ -1,27 +1,17 @@
-"""Computes inertia, torque, energy and end-effector motion of an arm, for many records at once.
+"""Computes inertia, torque, energy and end-effector motion of an arm for many records at once.
 
-A record is the state of an arm in one period of its control loop. There are two kinds of arms:
-the planar arm with two joints, and chains of any number of joints. `PlanarArmRows` and
-`ChainArmRows` have the same methods. Row k of their arguments and results belongs to record k.
-
-A chain has ten inertial parameters per link, but its torques depend only on some linear
-combinations of them, the base parameters. Estimation errors are expressed in the base
-parameters, which are found with a QR decomposition: M. Gautier, "Numerical calculation of the
-base inertial parameters of robots", J. Robotic Systems 8 (1991).
-
-Whether a rigid body can have the parameters of a link is checked by its pseudo-inertia: P. M.
-Wensing, S. Kim, J.-J. Slotine, "Linear matrix inequalities for physically consistent inertial
-parameter identification", IEEE Robotics and Automation Letters 3 (2018).
+`PlanarArmRows` models the planar arm with two joints, and `ChainArmRows` a chain with any
+number of joints. Both classes have the same methods. Row k of their arguments and results
+belongs to record k.
 
 Invariant:
     - The planar arm is computed independently of the simulation that executed the run.
-    - A chain is computed by the simulation's own functions, which the tests compare with
+    - A chain is computed with the simulation's own functions, which the tests compare with
       Pinocchio.
 """
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,7 +27,7 @@ from ..core import (
     forward_kinematics,
 )
 from ..records import JOINTS
-from ..scenario import ArmModel, Scenario
+from ..scenario import Scenario
 
 HANGING_RAD = 0.3
 """Largest angle between a hanging link and the downward vertical, in rad."""
@@ -57,11 +47,12 @@ B).
 def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
     """Multiplies many matrices by many vectors in one call, one product per log record.
 
-    The last axes count the records. NumPy then computes all records at once, which avoids a
+    The trailing axes enumerate the records. NumPy computes all of them at once, which avoids a
     slow Python loop.
 
     Args:
-        matrix: Entries of the matrices, shape (a, b, ...). The axes "..." count the records.
+        matrix: Entries of the matrices, shape (a, b, ...). The axes "..." enumerate the
+            records.
         vector: Components of the vectors, shape (b, ...), with the same records.
 
     Returns:
@@ -77,7 +68,7 @@ def solve_columns(A: Numbers, b: Numbers) -> Numbers:
     An example is the acceleration of an arm, where A is the inertia matrix and b the torque.
 
     Args:
-        A: Square matrices, shape (m, m, ...). The axes "..." count the records.
+        A: Square matrices, shape (m, m, ...). The axes "..." enumerate the records.
         b: Right-hand sides, shape (m, ...).
 
     Returns:
@@ -94,15 +85,15 @@ def solve_columns(A: Numbers, b: Numbers) -> Numbers:
 
 @dataclass(frozen=True)
 class PlacedArm:
-    """Dynamics of the planar arm with two joints, evaluated in given poses.
+    """Dynamics of the planar arm with two joints, evaluated at given poses.
 
-    The methods compute inertia, gravity and the other terms of the equation of motion. The
-    trailing axes of all arrays, written as "...", stand for the poses. All methods are analytic
-    in every argument. Therefore a complex step (a tiny imaginary change of an argument) gives
-    exact derivatives.
+    The methods compute inertia, gravity and the other terms of the equation of motion. In all
+    shapes, "..." stands for the axes that enumerate the poses. All methods are analytic in
+    every argument, so a complex step (a tiny imaginary change of an argument) yields exact
+    derivatives.
 
-    They follow "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic
-    Uncertainty", Eq. (1)-(5) and (24). `theory.textbook_arm.PlacedChain` has the same methods
+    The formulas are Eq. (1)-(5) and (24) of "Adaptive Control of Dual User Teleoperation with
+    Time Delay and Dynamic Uncertainty". `theory.textbook_arm.PlacedChain` has the same methods
     for arms with more joints.
 
     Attributes:
@@ -116,9 +107,9 @@ class PlacedArm:
     q: Numbers
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q), from joint accelerations to torques, in kg m^2.
+        """Returns the inertia matrix M(q), shape (2, 2, ...), in kg m^2.
 
-        The shape is (2, 2, ...), with one matrix per pose.
+        M(q) maps joint accelerations to torques. There is one matrix per pose.
 
         Args:
             theta: The five dynamic parameters of the arm, which combine masses, lengths and
@@ -138,8 +129,8 @@ class PlacedArm:
         """Returns the Coriolis matrix C(q, qd), shape (2, 2, ...), in kg m^2/s.
 
         C(q, qd) qd is the torque of the Coriolis and centrifugal forces. C is built from
-        Christoffel symbols. Therefore M' - 2 C is skew-symmetric with the rate M' of the
-        inertia matrix.
+        Christoffel symbols, which makes M' - 2 C skew-symmetric, where M' is the time
+        derivative of the inertia matrix.
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).
@@ -158,10 +149,9 @@ class PlacedArm:
         return np.array([row_1, row_2])
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the torque G(q) that holds the arm against gravity, in N m.
+        """Returns the torque G(q) that holds the arm against gravity, shape (2, ...), in N m.
 
-        It is the gradient of the potential energy with respect to the joint angles. The shape
-        is (2, ...), with one column per record.
+        G(q) is the gradient of the potential energy with respect to the joint angles.
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).
@@ -180,7 +170,7 @@ class PlacedArm:
         v: Numbers,
         a: Numbers,
     ) -> Numbers:
-        """Returns the torque that a reference motion requires, shape (2, ...), in N m.
+        """Returns the torque required for a reference motion, shape (2, ...), in N m.
 
         This torque is M(q) a + C(q, qd) v + G(q), which equals Y theta in Eq. (12). M is the
         inertia matrix, C the Coriolis matrix, G the gravity torque, and Y the regressor.
@@ -200,8 +190,8 @@ class PlacedArm:
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns the regressor Y(q, qd, v, a) of Eq. (12), shape (2, 5, ...).
 
-        The torque is linear in the parameters theta: the required torque is Y theta. Therefore
-        column p of Y is the torque of an arm whose parameter p is 1 while all others are 0.
+        The required torque is linear in the parameters theta and equals Y theta. Column p of Y
+        is therefore the torque of an arm whose parameter p is 1 while all others are 0.
 
         Args:
             qd: Joint velocities, shape (2, ...), in rad/s.
@@ -214,12 +204,12 @@ class PlacedArm:
         return self.required_torque(unit_parameters, qd, v, a)
 
     def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns zeros, shape (2, ...), because this arm has no friction in its joints.
+        """Returns zeros, shape (2, ...), because this arm has no joint friction.
 
-        The method exists so that the arm can take the place of a chain with friction.
+        This method exists because chains, which may have friction, are called in the same way.
 
         Args:
-            v: Joint velocities, shape (2, ...), in rad/s. They determine only the shape.
+            v: Joint velocities, shape (2, ...), in rad/s. Only the shape is used.
         """
         return 0.0 * v
 
@@ -240,11 +230,10 @@ class PlacedArm:
         return solve_columns(M, torque - bias_torque)
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position (x, y) of the end effector by forward kinematics, in m.
+        """Returns the position (x, y) of the end effector, shape (2, ...), in m.
 
-        For links of the lengths l_1 and l_2, x = l_1 cos q_1 + l_2 cos(q_1 + q_2), and y has
-        sines in place of the cosines. The origin is the first joint. The shape is (2, ...),
-        with one column per record.
+        With link lengths l_1 and l_2, x = l_1 cos q_1 + l_2 cos(q_1 + q_2), and y has sines in
+        place of the cosines. The origin is the first joint.
         """
         l1_m, l2_m = self.lengths_m
         inner, q_2 = self.q
@@ -254,10 +243,10 @@ class PlacedArm:
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
-        """Returns the matrix J from joint velocities to the velocity of the end effector (tip).
+        """Returns the Jacobian J of the end effector's position, shape (2, 2, ...), in m/rad.
 
-        J is called the Jacobian. The shape is (2, 2, ...), in m/rad. Rows are x and y, columns
-        are the two joints.
+        J maps joint velocities to the velocity of the end effector. The rows are x and y, the
+        columns the two joints.
         """
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
@@ -271,13 +260,13 @@ class PlacedArm:
 class EndEffectorRows(NamedTuple):
     """Position and velocity of an end effector (the tip of an arm) in K poses.
 
-    The planar arm moves in two coordinates, and a chain of joints in three.
+    The planar arm moves in two coordinates, a chain in three.
 
     Attributes:
         position: Position in the frame of the base, shape (K, 2) or (K, 3), in m.
         speed: Velocity, shape (K, 2) or (K, 3), in m/s.
-        J: Jacobian of the position, shape (K, 2, n) or (K, 3, n), in m/rad. It has a row for
-            each coordinate and a column for each of the n joints.
+        J: Jacobian of the position, shape (K, 2, n) or (K, 3, n), in m/rad. There is one row
+            per coordinate and one column per joint.
     """
 
     position: Array
@@ -286,14 +275,14 @@ class EndEffectorRows(NamedTuple):
 
     @property
     def last(self) -> "EndEffectorRows":
-        """Position, velocity and Jacobian in the last of the poses, as arrays with K = 1."""
+        """The end effector in the last pose only, as arrays with K = 1."""
         return EndEffectorRows(self.position[-1:], self.speed[-1:], self.J[-1:])
 
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:
-        """Finds the force at the end effector that best explains a joint torque.
+        """Finds the end-effector force that best explains a joint torque.
 
         The force F minimises the difference between the torque and J'F, where J is the
-        Jacobian. Among several such forces, the smallest is returned.
+        Jacobian. If several forces do so, the smallest is returned.
 
         Args:
             torque: Joint torque, shape (K, n), in N m.
@@ -311,10 +300,10 @@ class EndEffectorRows(NamedTuple):
 
 
 class PlanarArmRows(NamedTuple):
-    """Model of the planar arm with two joints that is evaluated in K poses at once.
+    """Model of the planar arm with two joints, evaluated at K poses at once.
 
-    In contrast to `PlacedArm`, every array has a row for each pose. `ChainArmRows` has the same
-    methods for arms with more joints.
+    Unlike `PlacedArm`, all arrays have one row per pose. `ChainArmRows` has the same methods
+    for arms with more joints.
 
     Attributes:
         theta: True dynamic parameters of the arm, Eq. (24), shape (5,).
@@ -328,27 +317,27 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def task(self) -> None:
-        """Always `None`, because the planar arm follows other arms joint by joint.
+        """Always `None`, because the planar arm follows its peers joint by joint.
 
-        `ChainArmRows.task` contains the settings of arms that follow by end effector. Callers
-        therefore need not distinguish the two kinds of arms.
+        It exists because `ChainArmRows.task` describes arms that follow with the end effector.
+        Callers therefore need not distinguish the two kinds of arms.
         """
         return
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """Marks the parameters of the arm on which the gravity torque depends, shape (5,).
+        """Marks the parameters on which the gravity torque depends, shape (5,).
 
-        The entries are True for theta_4 and theta_5, the products of masses and lever arms. The
-        other three describe inertia alone.
+        True for theta_4 and theta_5, the products of masses and lever arms. The other three
+        parameters describe inertia only.
         """
         return np.arange(5) >= 3
 
     def place(self, q: Array) -> PlacedArm:
-        """Returns the dynamics of the arm, such as its inertia matrix, in each of K poses.
+        """Returns the dynamics of the arm, such as its inertia matrix, at K poses.
 
-        Functions of the poses alone, such as sines of the angles, are computed only once. The
-        arrays of the returned object have the poses on their last axis.
+        Terms that depend only on the poses, such as sines of the angles, are computed only
+        once. The arrays of the returned object have the poses on their last axis.
 
         Args:
             q: Joint angles of the K poses, shape (K, 2), in rad.
@@ -358,15 +347,16 @@ class PlanarArmRows(NamedTuple):
     def weightless(self) -> "PlanarArmRows":
         """Returns a model of the same arm without gravity.
 
-        The torque of such an arm is linear in the reference velocity v and acceleration a.
-        Therefore the effects of parts of a motion can be computed separately and added.
+        The torque of this model is linear in the reference velocity v and acceleration a, so
+        the contributions of parts of a motion can be computed separately and added.
         """
         return self._replace(g=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
-        """Multiplies the inertia matrix M(q) by a vector x, in each of K poses.
+        """Multiplies the inertia matrix M(q) by a vector x at each of K poses.
 
-        With velocities, the products are momenta, and with accelerations they are torques.
+        If x is a velocity, the product is a momentum, and if x is an acceleration, the product
+        is a torque.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -387,17 +377,17 @@ class PlanarArmRows(NamedTuple):
         v: Array,
         a: Array,
     ) -> Array:
-        """Returns the torque with which an adaptive law compensates the estimated dynamics.
+        """Returns the torque with which an adaptive law compensates for the estimated dynamics.
 
-        The torque is Y theta_hat. Y is the regressor, the matrix that yields the torque of a
-        motion when it is multiplied by the dynamic parameters.
+        The torque is Y theta_hat, where Y is the regressor: multiplied by the dynamic
+        parameters, Y gives the torque that a motion requires.
 
         Args:
             theta_hat: Estimates of the arm's five dynamic parameters in K poses, shape (K, 5).
             q: Joint angles, shape (K, 2), in rad.
             qd: Joint velocities, shape (K, 2), in rad/s.
-            v: Velocities that the joints should have, shape (K, 2), in rad/s.
-            a: Accelerations that the joints should have, shape (K, 2), in rad/s^2.
+            v: Reference velocities of the joints, shape (K, 2), in rad/s.
+            a: Reference accelerations of the joints, shape (K, 2), in rad/s^2.
 
         Returns:
             Torque, shape (K, 2), in N m.
@@ -416,14 +406,14 @@ class PlanarArmRows(NamedTuple):
     ) -> Array:
         """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
 
-        Y is the regressor: the torque that a motion requires is Y times the dynamic parameters.
-        Y' is its transpose, and r = qd - v the velocity error.
+        Y is the regressor (the torque required for a motion is Y times the dynamic parameters),
+        Y' its transpose, and r = qd - v the velocity error.
 
         Args:
             q: Joint angles in K poses, shape (K, 2), in rad.
             qd: Joint velocities, shape (K, 2), in rad/s.
-            v: Velocities that the joints should have, shape (K, 2), in rad/s.
-            a: Accelerations that the joints should have, shape (K, 2), in rad/s^2.
+            v: Reference velocities of the joints, shape (K, 2), in rad/s.
+            a: Reference accelerations of the joints, shape (K, 2), in rad/s^2.
             r: Velocity errors qd - v, shape (K, 2), in rad/s.
 
         Returns:
@@ -435,9 +425,7 @@ class PlanarArmRows(NamedTuple):
         return gradient
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) with which motors hold the arm still against gravity, in N m.
-
-        K poses are evaluated at once.
+        """Returns the torque G(q) that holds the arm still against gravity, in N m.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -452,8 +440,8 @@ class PlanarArmRows(NamedTuple):
     def potential_energy(self, q: Array) -> Array:
         """Returns the potential energy of the arm in each of K poses, in J.
 
-        It is g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), with the gravitational acceleration
-        g and the parameters theta_4 and theta_5. It is zero when the arm is level.
+        The energy is g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)), where g is the gravitational
+        acceleration. It is zero when both links are horizontal.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -472,15 +460,14 @@ class PlanarArmRows(NamedTuple):
     def friction(self, speed: Array) -> Array:
         """Returns the friction torques of the joints, which are zero here, shape (K, 2).
 
-        The method exists because `ChainArmRows` has it for chains, whose joints may have
-        friction.
+        This method exists because the joints of a `ChainArmRows` may have friction.
         """
         return np.zeros_like(speed)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - chains need it
         """Returns zeros, because the joints of this arm have no mechanical stops.
 
-        The method exists so that this arm can be used in place of a chain.
+        This method exists because the joints of a `ChainArmRows` may have stops.
 
         Args:
             q: Joint angles in K poses, shape (K, 2), in rad.
@@ -492,10 +479,9 @@ class PlanarArmRows(NamedTuple):
         return np.zeros_like(q)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns position, velocity and Jacobian of the end effector (tip) of a planar arm.
+        """Returns position, velocity and Jacobian of the end effector at K poses.
 
-        The Jacobian is the matrix from joint velocities to the velocity of the end effector. K
-        poses are evaluated at once.
+        The Jacobian maps joint velocities to the velocity of the end effector.
 
         Args:
             q: Joint angles, shape (K, 2), in rad.
@@ -511,10 +497,47 @@ class PlanarArmRows(NamedTuple):
             J=J.transpose(2, 0, 1),
         )
 
+    def joint_positions_m(self, q: Array) -> Array:
+        """Returns the positions of the base, the elbow joint and the end effector, for drawing.
+
+        Lines between successive points represent the links of the arm.
+
+        Args:
+            q: Joint angles in K poses, shape (K, 2), in rad.
+
+        Returns:
+            The three positions in every pose, shape (K, 3, 2), in m.
+        """
+        points_per_pose = 1 + JOINTS
+        points = np.zeros((len(q), points_per_pose, 2))
+        for pose, angles in zip(points, q, strict=True):
+            pose[1:] = forward_kinematics(self.lengths_m, angles)
+        return points
+
+    @property
+    def upright_axes(self) -> None:
+        """Always `None`, because the planar arm is drawn in its own plane.
+
+        For a chain, `ChainArmRows.upright_axes` returns the axes of an upright frame.
+        """
+        return
+
+    @property
+    def least_inertia_kg_m2(self) -> float:
+        """A lower bound on the eigenvalues of the inertia matrix M(q) for all poses q.
+
+        The smallest eigenvalue occurs at cos q2 = 1 or -1.
+        """
+        poses = np.array([[0.0, 0.0], [0.0, np.pi]])
+        extreme_poses = PlacedArm(0.0, self.lengths_m, poses)
+        inertia_matrices = extreme_poses.inertia_matrix(self.theta).T
+        eigenvalues = np.linalg.eigvalsh(inertia_matrices)
+        return float(eigenvalues.min())
+
     def hanging_angle(self, q: Array) -> float:
         """Returns the largest angle between a link and the direction straight down, in rad.
 
-        A small angle means that the arm hangs down, as an arm does when its motors do not hold
+        A small angle means that the arm hangs down, which happens when its motors do not hold
         it up.
 
         Args:
@@ -529,13 +552,12 @@ class PlanarArmRows(NamedTuple):
 
 
 class ChainArmRows(NamedTuple):
-    """A serial arm with n joints, for computations over K poses at once.
+    """Model of a serial arm with n joints, evaluated at K poses at once.
 
-    The arm is a chain of rigid links. Torques are computed by the same recursions from link to
-    link as in the simulation. The parameters theta determine the inertia matrix M, the Coriolis
-    matrix C and the gravity torque G of the links. The inertia of the drives (armature) and the
-    friction of the joints are known to the control laws. Therefore the torques of the laws
-    include them.
+    The arm is a chain of rigid links. Torques are computed with the same recursions from link
+    to link as in the simulation. The parameters theta determine the inertia matrix M, the
+    Coriolis matrix C and the gravity torque G of the links. The control laws know the inertia
+    of the drives (armature) and the joint friction, so their torques include both.
 
     Attributes:
         theta: True dynamic parameters, shape (10 n,): mass, first moment and inertia of each
@@ -548,9 +570,9 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """Settings for following other arms with the end effector (tip), such as its axes.
+        """Settings for following peers with the end effector, such as its axes.
 
-        `None` if the arm follows other arms joint by joint.
+        `None` if the arm follows its peers joint by joint.
         """
         return self.chain.task
 
@@ -558,8 +580,8 @@ class ChainArmRows(NamedTuple):
     def gravity_parameters(self) -> NDArray[np.bool_]:
         """Marks the parameters on which the gravity torque depends, shape (10 n,).
 
-        The entries are True for the mass m and the first moment m c of every link, where c is
-        its centre of mass.
+        True for the mass m and the first moment m c of every link, where c is the centre of
+        mass.
         """
         indices = np.arange(len(self.theta))
         index_in_link = indices % LINK_PARAMETERS
@@ -582,10 +604,10 @@ class ChainArmRows(NamedTuple):
         return self._replace(chain=chain)
 
     def weightless(self) -> "ChainArmRows":
-        """Returns a model of the same arm without gravity and dry (Coulomb) friction.
+        """Returns a model of the same arm without gravity or dry (Coulomb) friction.
 
-        The torque of this model is linear in the reference velocity v and acceleration a.
-        Therefore the effects of parts of a motion can be computed separately and added.
+        The torque of this model is linear in the reference velocity v and acceleration a, so
+        the contributions of parts of a motion can be computed separately and added.
         """
         bare = self._replace_in_joints(coulomb=0.0)
         no_gravity = (0.0, 0.0, 0.0)
@@ -593,17 +615,17 @@ class ChainArmRows(NamedTuple):
         return bare._replace(chain=weightless_chain)
 
     def without_drives(self) -> "ChainArmRows":
-        """Returns a model of the same arm without friction and without its motors' inertia.
+        """Returns a model of the same arm without friction or motor inertia.
 
-        The torque of this model is linear in the parameters theta (masses and inertias), which
-        is required for estimating them.
+        The torque of this model is linear in the parameters theta (masses and inertias), as
+        required to estimate them.
         """
         return self._replace_in_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
-        """Returns the product of the inertia matrix, with drives, and a vector, in each pose.
+        """Multiplies the inertia matrix, including the drives, by a vector at each of K poses.
 
-        The product (M(q) + armature) x is computed by one recursion along the chain without
+        The product (M(q) + armature) x is computed with one recursion along the chain without
         gravity. The matrix itself is never formed.
 
         Args:
@@ -631,10 +653,11 @@ class ChainArmRows(NamedTuple):
         v: Array,
         a: Array,
     ) -> Array:
-        """Returns the torque with which a law compensates the dynamics that it estimates.
+        """Returns the torque with which a law compensates for the dynamics that it estimates.
 
-        It is Y(q, qd, v, a) theta_hat + armature a + friction(v), with the regressor Y of the
-        links. The law knows the inertia of the drives (armature) and the friction.
+        This torque is Y(q, qd, v, a) theta_hat + armature a + friction(v), where Y is the
+        regressor of the links. The law knows the inertia of the drives (armature) and the
+        friction.
 
         Args:
             theta_hat: Estimates of the dynamic parameters, shape (K, 10 n), or (1, 10 n) if
@@ -659,14 +682,14 @@ class ChainArmRows(NamedTuple):
     ) -> Array:
         """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
 
-        Y is the regressor: the torque that a motion requires is Y times the dynamic parameters.
-        Y' is its transpose, and r = qd - v the velocity error. The chain has n joints.
+        Y is the regressor (the torque required for a motion is Y times the dynamic parameters),
+        Y' its transpose, and r = qd - v the velocity error. The chain has n joints.
 
         Args:
             q: Joint angles in K poses, shape (K, n), in rad.
             qd: Joint velocities, shape (K, n), in rad/s.
-            v: Velocities that the joints should have, shape (K, n), in rad/s.
-            a: Accelerations that the joints should have, shape (K, n), in rad/s^2.
+            v: Reference velocities of the joints, shape (K, n), in rad/s.
+            a: Reference accelerations of the joints, shape (K, n), in rad/s^2.
             r: Velocity errors qd - v, shape (K, n), in rad/s.
 
         Returns:
@@ -675,9 +698,7 @@ class ChainArmRows(NamedTuple):
         return self._dynamics.compute_gradient(q, qd, v, a)
 
     def gravity_torque(self, q: Array) -> Array:
-        """Returns the torque G(q) with which motors hold the arm still against gravity, in N m.
-
-        The arm is a chain of n joints, and K poses are evaluated at once.
+        """Returns the torque G(q) that holds the arm still against gravity, in N m.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -695,25 +716,25 @@ class ChainArmRows(NamedTuple):
         )
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns the energy of the links in the field of gravity, at joint angles `q`.
+        """Returns the potential energy of the links at joint angles `q`, in J.
 
-        Its zero is at the height of the base. `q` has the shape (K, n), and the result the
-        shape (K,), in J.
+        The energy is zero at the height of the base. `q` has shape (K, n), and the result shape
+        (K,).
         """
         _, _, energy = self._dynamics.place(q)
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque that overcomes the dry and viscous friction of the joints.
+        """Returns the torque needed to overcome the dry and viscous friction of the joints.
 
-        Dry friction has a constant size, and viscous friction grows with the velocity.
+        Dry friction is constant in magnitude, and viscous friction grows with the velocity.
 
         Args:
-            speed: Joint velocities at K times, shape (K, n) for n joints, in rad/s.
+            speed: Joint velocities at K instants, shape (K, n), in rad/s.
 
         Returns:
-            Torque, shape (K, n), in N m. It has the sign of the velocity. The friction itself
-            acts with the opposite sign.
+            Torque, shape (K, n), in N m. It has the sign of the velocity, while the friction
+            itself acts with the opposite sign.
         """
         viscous = self._column("viscous") * speed
         # a smooth sign of the speed
@@ -723,10 +744,10 @@ class ChainArmRows(NamedTuple):
         return viscous + coulomb
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
-        """Returns the torque of the mechanical stops on the joints, in N m.
+        """Returns the torque that the mechanical stops exert on the joints, in N m.
 
-        A stop limits the angle of a joint. It acts like a spring with a damper that pushes the
-        joint back and never pulls it.
+        A stop limits the angle of a joint. It acts like a spring and damper that push the joint
+        back and never pull it.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -750,10 +771,10 @@ class ChainArmRows(NamedTuple):
         return lower_stop - upper_stop
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
-        """Returns position, velocity and Jacobian of the end effector (tip) in each of K poses.
+        """Returns position, velocity and Jacobian of the end effector at K poses.
 
-        The Jacobian is the matrix from joint velocities to the velocity of the end effector.
-        All are expressed in the frame of the arm's base.
+        The Jacobian maps joint velocities to the velocity of the end effector. All results are
+        in the base frame of the arm.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -767,9 +788,9 @@ class ChainArmRows(NamedTuple):
     def jacobian_rate(self, q: Array, qd: Array) -> Array:
         """Returns the time derivative of the Jacobian of the end effector's position.
 
-        Column i of the Jacobian is the velocity of the end effector for unit speed of joint i.
-        It changes for two reasons: it turns with all joints up to i, and the joints after i
-        move the end effector relative to the axis of joint i.
+        Column i of the Jacobian is the velocity of the end effector when joint i moves at unit
+        speed. It changes for two reasons: its axis turns with the joints up to i, and the
+        joints after i move the end effector relative to the axis of joint i.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -794,19 +815,65 @@ class ChainArmRows(NamedTuple):
         rate: Array = turning + moving
         return rate.transpose(0, 2, 1)
 
-    def hanging_angle(self, q: Array) -> float:
-        """Returns an angle, in rad, that says how far the chain is from hanging straight down.
+    def joint_positions_m(self, q: Array) -> Array:
+        """Returns the positions of the base, the joints and the end effector, for drawing.
 
-        The angle compares the chain's potential energy E with the lowest and highest energy
-        that it can have: cos(angle) = 1 - 2 (E - lowest) / (highest - lowest). So 0 means
-        hanging down, and pi means upright. The search for the extremes starts from this pose
-        and varies one joint after the other. Mechanical stops are ignored.
+        Lines between successive points represent the links of the arm.
+
+        Args:
+            q: Joint angles in K poses, shape (K, n), in rad.
+
+        Returns:
+            The L positions in every pose, shape (K, L, 3), in m.
+        """
+        return self._dynamics.place_points(q)
+
+    @property
+    def upright_axes(self) -> Array:
+        """The axes of an upright frame for drawings of the arm.
+
+        A URDF file may mount the base of a chain in any orientation, so the upward direction is
+        taken from gravity. Without gravity, the z axis of the base is assumed to point up.
+
+        The rows are the unit vectors forward, sideways and up, in the base frame, shape (3, 3).
+        Multiply points of shape (..., 3) by the transpose to obtain upright coordinates.
+        """
+        gravity = np.array(self.chain.gravity_m_s2)
+        size = float(np.linalg.norm(gravity))
+        up = np.array([0.0, 0.0, 1.0])
+        if size:
+            up = -gravity / size
+        # the first axis that is not nearly vertical: x, unless gravity acts along x
+        is_vertical = np.abs(up) > 0.9
+        axis_index = int(np.argmin(is_vertical))
+        axis = np.eye(3)[axis_index]
+        vertical_part = (axis @ up) * up
+        forward = axis - vertical_part
+        forward /= np.linalg.norm(forward)
+        sideways = np.cross(up, forward)
+        return np.array([forward, sideways, up])
+
+    @property
+    def least_inertia_kg_m2(self) -> float:
+        """A lower bound on the eigenvalues of the inertia matrix M(q) for all poses q.
+
+        The bound is the smallest drive inertia, since each drive moves with its joint.
+        """
+        return min(joint.armature_kg_m2 for joint in self.chain.joints)
+
+    def hanging_angle(self, q: Array) -> float:
+        """Returns an angle, in rad, that tells how far the chain is from hanging straight down.
+
+        The angle compares the potential energy E of the chain with the lowest and highest
+        energy that it can reach: cos(angle) = 1 - 2 (E - lowest) / (highest - lowest). An angle
+        of 0 means hanging down, and pi means upright. The search for the extremes starts from
+        this pose and varies one joint at a time. Mechanical stops are ignored.
 
         Args:
             q: Joint angles of one pose, shape (n,) for n joints, in rad.
 
         Returns:
-            The angle. Infinite if gravity has no effect on the chain.
+            The angle, or infinity if gravity has no effect on the chain.
         """
         lowest_j = self._find_extreme_energy(q, 1.0)
         highest_j = self._find_extreme_energy(q, -1.0)
@@ -854,14 +921,14 @@ ArmRows = PlanarArmRows | ChainArmRows
 
 
 def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
-    """Returns the model of an arm for computations over many poses at once.
+    """Returns the model of a site's arm for computations over many poses at once.
 
-    Certificate and metrics evaluate inertia and energy at every record of a log, for which one
+    The certificate and the metrics evaluate inertia and energy at every record of a log. One
     call per record would be too slow.
 
     Args:
-        scenario: The description of the experiment, which defines the arm.
-        site: Name of the site, the process that runs the arm.
+        scenario: The scenario, which defines the arm.
+        site: Name of the site.
     """
     model = scenario.arms[site]
     spec = scenario.sites[site]
@@ -873,226 +940,3 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
         task = chain.task._replace(posture=spec.q0_rad)
         chain = chain._replace(task=task)
     return ChainArmRows(model.theta, chain)
-
-
-def joint_positions_m(arm: ArmModel, q: Array) -> Array:
-    """Returns the positions of the base, the joints and the end effector, for drawing an arm.
-
-    Lines between successive points are the links of the arm.
-
-    Args:
-        arm: The arm.
-        q: Joint angles in K poses, shape (K, n), in rad.
-
-    Returns:
-        Positions of these L points in m, shape (K, L, 2) for the planar arm, or (K, L, 3) for
-        chains.
-    """
-    if arm.chain is not None:
-        return ChainDynamics(arm.chain, arm.theta).place_points(q)
-    points_per_pose = 1 + JOINTS
-    points = np.zeros((len(q), points_per_pose, 2))
-    for pose, angles in zip(points, q, strict=True):
-        pose[1:] = forward_kinematics(arm.lengths_m, angles)
-    return points
-
-
-def upright_axes(chain: ChainSetup) -> Array:
-    """Returns the axes of a frame that stands upright, for drawings of the arm.
-
-    A URDF file may mount the base of a chain in any orientation. The direction of gravity shows
-    which way is up. Without gravity, the z axis of the base counts as up.
-
-    Returns:
-        Unit vectors forward, sideways and up as rows, in the frame of the base, shape (3, 3).
-            The product of points, shape (..., 3), and the transpose are the upright
-            coordinates.
-    """
-    gravity = np.array(chain.gravity_m_s2)
-    size = float(np.linalg.norm(gravity))
-    up = np.array([0.0, 0.0, 1.0])
-    if size:
-        up = -gravity / size
-    # the first axis that is not nearly vertical: x, unless gravity acts along x
-    is_vertical = np.abs(up) > 0.9
-    axis_index = int(np.argmin(is_vertical))
-    axis = np.eye(3)[axis_index]
-    vertical_part = (axis @ up) * up
-    forward = axis - vertical_part
-    forward /= np.linalg.norm(forward)
-    sideways = np.cross(up, forward)
-    return np.array([forward, sideways, up])
-
-
-DEPENDENT_SHARE = 1e-9
-"""Largest part of a column that is independent of the columns before it for the column to count
-as dependent on them, relative to the column.
-"""
-
-
-class _BaseParameters(NamedTuple):
-    """Base parameters of an arm: combinations of masses and inertias that torques determine.
-
-    No measurement of torque and motion can determine every single dynamic parameter in the
-    vector theta of a chain. Such a measurement determines only the B linear combinations in the
-    rows of `combination`, and the base parameters are combination @ theta.
-
-    Attributes:
-        kept: For each combination, the index of the parameter after which the combination is
-            named, ascending, shape (B,).
-        combination: Factors of all P parameters in each combination, shape (B, P). The factor
-            of the parameter that gives the name is 1.
-    """
-
-    kept: NDArray[np.int64]
-    combination: Array
-
-
-def stack_regressors(arm: ChainArmRows, states: int) -> Array:
-    """Returns the regressors of random motions, stacked into one matrix.
-
-    The regressor maps the dynamic parameters to joint torques. The column space of this matrix
-    shows which combinations of parameters have an effect on torques.
-
-    Args:
-        arm: The chain with n joints.
-        states: Number of random states, each with angles, velocities and accelerations.
-
-    Returns:
-        Matrix, shape (states n, 10 n).
-    """
-    random = np.random.default_rng(1)
-    n = len(arm.chain.joints)
-    parameters = len(arm.theta)
-    q = random.uniform(-np.pi, np.pi, (states, n))
-    qd, qdd = random.normal(size=(2, states, n))
-    # column p of a regressor is the torque of a chain whose only nonzero parameter is p, 1
-    state_of_row = np.repeat(np.arange(states), parameters)
-    unit_parameters = np.tile(np.eye(parameters), (states, 1))
-    links = arm.without_drives()
-    torque = links.law_torque(
-        theta_hat=unit_parameters,
-        q=q[state_of_row],
-        qd=qd[state_of_row],
-        v=qd[state_of_row],
-        a=qdd[state_of_row],
-    )
-
-    columns = torque.reshape(states, parameters, n)
-    regressors = columns.transpose(0, 2, 1)
-    return regressors.reshape(-1, parameters)
-
-
-@lru_cache(maxsize=64)
-def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> _BaseParameters:
-    """Finds the base parameters of a serial arm by a QR decomposition (Gautier 1991).
-
-    Base parameters are the combinations of masses and inertias that joint torques determine. If
-    a column of the stacked regressors depends linearly on the columns before it, torques do not
-    determine the parameter of this column by itself.
-
-    Args:
-        chain: The chain.
-        learnt: True for each parameter that the control law learns.
-    """
-    arm = ChainArmRows(np.zeros(len(learnt)), chain)
-    # random motions excite every combination that has an effect on the torques
-    regressors = stack_regressors(arm, 4 * LINK_PARAMETERS)
-    learnt_columns = regressors[:, list(learnt)]
-    learnt_indices = np.flatnonzero(learnt)
-
-    matrix_norm = float(np.linalg.norm(learnt_columns))
-    root_of_columns = np.sqrt(learnt_columns.shape[1])
-    least_norm = DEPENDENT_SHARE * matrix_norm / root_of_columns
-
-    basis = np.zeros((len(learnt_columns), 0))
-    independent = []
-    for column_index, column in enumerate(learnt_columns.T):
-        # Gram-Schmidt, twice: the first pass leaves rounding errors of the size of the column
-        remainder = column - basis @ (basis.T @ column)
-        remainder -= basis @ (basis.T @ remainder)
-        remainder_norm = float(np.linalg.norm(remainder))
-        if remainder_norm > least_norm:
-            basis = np.column_stack([basis, remainder / remainder_norm])
-            independent.append(column_index)
-
-    independent_columns = learnt_columns[:, independent]
-    factors = np.linalg.lstsq(independent_columns, learnt_columns, rcond=None)[0]
-    contributes = np.abs(factors) > DEPENDENT_SHARE
-
-    parameter_indices = learnt_indices[independent]
-    base_count = len(independent)
-    combination = np.zeros((base_count, len(learnt)))
-    combination[:, learnt_indices] = np.where(contributes, factors, 0.0)
-    combination[:, parameter_indices] = np.eye(base_count)
-    return _BaseParameters(parameter_indices, combination)
-
-
-def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> _BaseParameters:
-    """Finds which combinations of an arm's dynamic parameters can be learnt from its torques.
-
-    Torques do not determine every single parameter of a chain, but only some linear
-    combinations of the parameters, which are called base parameters. For the planar arm, each
-    of its five parameters is a base parameter.
-
-    Args:
-        arm: The arm, with P dynamic parameters.
-        learnt: True for each parameter that the control law learns, shape (P,). The other
-            parameters are in no combination.
-    """
-    if isinstance(arm, ChainArmRows):
-        return _find_chain_base(arm.chain, tuple(learnt.tolist()))
-    kept = np.flatnonzero(learnt)
-    combination = np.eye(len(learnt))[kept]
-    return _BaseParameters(kept, combination)
-
-
-def find_pseudo_inertias(theta: Array) -> Array:
-    """Returns the pseudo-inertia of every link, shape (n, 4, 4).
-
-    This symmetric matrix contains the ten parameters of a link, and is positive definite if and
-    only if a rigid body can have these parameters. It is [[S, m c], [m c', m]] with S = tr(I) /
-    2 - I. Here m is the mass of the link, m c its first moment, I its inertia, and tr the
-    trace.
-
-    Args:
-        theta: Parameters of the links, shape (10 n,).
-    """
-    links = theta.reshape(-1, LINK_PARAMETERS)
-    mass = links[:, 0]
-    moment = links[:, 1:4]
-    inertias = links[:, 4:]
-    xx, xy, yy, xz, yz, zz = inertias.T
-    row_x = [xx, xy, xz]
-    row_y = [xy, yy, yz]
-    row_z = [xz, yz, zz]
-    inertia = np.array([row_x, row_y, row_z])
-    inertia_of_link = inertia.transpose(2, 0, 1)
-    half_trace = 0.5 * (xx + yy + zz)
-    half_trace_of_link = half_trace[:, np.newaxis, np.newaxis]
-    S = half_trace_of_link * np.eye(3) - inertia_of_link
-
-    count = len(links)
-    pseudo_inertias = np.zeros((count, 4, 4))
-    pseudo_inertias[:, :3, :3] = S
-    pseudo_inertias[:, :3, 3] = moment
-    pseudo_inertias[:, 3, :3] = moment
-    pseudo_inertias[:, 3, 3] = mass
-    return pseudo_inertias
-
-
-def find_consistent_links(theta: Array) -> list[bool]:
-    """Finds the links whose learnt masses and inertias a rigid body can have.
-
-    A negative mass, for example, is impossible. The condition is that the link's pseudo-inertia
-    (see `find_pseudo_inertias`) is positive definite (Wensing et al. 2018).
-
-    Args:
-        theta: Parameters of the links, shape (10 n,).
-    """
-    pseudo_inertias = find_pseudo_inertias(theta)
-    eigenvalues = np.linalg.eigvalsh(pseudo_inertias)
-    least_eigenvalues = eigenvalues.min(axis=1)
-    is_positive_definite = least_eigenvalues > 0.0
-    consistent: list[bool] = is_positive_definite.tolist()
-    return consistent

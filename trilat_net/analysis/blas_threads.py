@@ -1,11 +1,10 @@
-"""Keeps the linear algebra of NumPy and SciPy (OpenBLAS) on one thread.
+"""Restricts the linear algebra of NumPy and SciPy (OpenBLAS) to one thread.
 
-The matrices of this package are small. OpenBLAS distributes even these over all processors, and
-its idle threads wait actively. The computation of a characteristic root then takes twice the
-processor time, and the processes of a parameter sweep slow each other down.
+The matrices of this package are small, but OpenBLAS distributes even small matrices over all
+processors, and its idle threads busy-wait. As a result, computing a characteristic root takes
+twice the processor time, and the processes of a parameter sweep slow each other down.
 
-NumPy and SciPy each contain their own copy of OpenBLAS, and each copy has its own number of
-threads.
+NumPy and SciPy each contain their own copy of OpenBLAS with its own thread count.
 """
 
 import ctypes
@@ -43,11 +42,11 @@ class _BlasFunctions(NamedTuple):
 
 @contextmanager
 def limit_blas_threads() -> Iterator[None]:
-    """Limits the linear algebra of NumPy and SciPy to one thread while the context is active.
+    """Limits the linear algebra of NumPy and SciPy to one thread within the context.
 
-    The function can also decorate another function. The numbers of threads are restored at the
-    end, also after an exception. SciPy is limited only if it has been imported before. If a
-    library has no functions to set the number of threads, its threads are left as they are.
+    Can also be used as a decorator. The previous thread counts are restored on exit, even after
+    an exception. SciPy is limited only if it has already been imported. A library that provides
+    no functions to set the thread count is left alone.
     """
     libraries = []
     for module_name in _MODULES:

@@ -1,12 +1,12 @@
-"""Defines the evidence on the stability of a run, and the decision that rests on it.
+"""Defines the evidence on the stability of a run, and the decision based on it.
 
-`stability_decision` decides, and the package `presentation` writes the sentences about the
-basis of a decision and the reasons against a better one.
+`stability_decision` decides. The package `presentation` generates the sentences about the basis
+of a decision and the reasons against a better one.
 
 Invariant:
-    - A decision and its evidence contain only names and numbers, apart from phrases that the
-      control laws and the analysis of roots provide.
-    - Every name of `Basis` and of `Obstacle` refers to numbers in the evidence, `RunFindings`.
+    - A decision and its evidence contain only names and numeric values, apart from phrases that
+      the control laws and the analysis of roots provide.
+    - Every member of `Basis` and `Obstacle` refers to values in the evidence, `RunFindings`.
 """
 
 import math
@@ -74,36 +74,36 @@ Doubt = StabilityVerdict | UnsuppliedGrowth | ObservedEnergy | EvidenceDoubt
 
 
 class LoopRoots(NamedTuple):
-    """Growth rates (roots) of small motions about the pose at which a run ended.
+    """Growth rates (roots) of small motions about the final pose of a run.
 
-    They are characteristic roots of the linearised control loop. If the real parts of all of
-    them are negative, small motions die away. `theory.loop_roots` computes them for every
+    They are the characteristic roots of the linearised control loop. Small motions decay if the
+    real parts of all roots are negative. `theory.loop_roots` computes the roots for every
     command.
 
     Attributes:
         verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
             cannot be linearised.
-        rate_per_s: Largest real part of the roots, in 1/s, without those that are zero because
-            of the structure of the loop. `None` if there is no such root.
+        rate_per_s: Largest real part of the roots, in 1/s, excluding roots that are zero
+            because of the structure of the loop. `None` if there is no other root.
         exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
             the roots may cast doubt on a run, but prove nothing.
-        distance_rad: Largest difference between the last angle of a joint and its angle at the
+        distance_rad: Largest difference between the final angle of a joint and its angle in the
             pose at rest to which the roots belong, in rad.
-        programs: Sites whose arms a program of the user moves. The linearised loop leaves out
-            how these programs react to the arms.
+        programs: Sites whose arms are moved by a user's program. The linearised loop omits how
+            these programs react to the arms.
         is_numerical: True if the code of a user's law was differentiated numerically. Such
             roots can refute a run, but not prove it stable.
-        swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s. `None`
-            if no computed root oscillates.
+        swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s, or
+            `None` if no computed root oscillates.
         omega_rad_s: Angular frequency of the root with the largest real part, in rad/s.
-        drifting: Number of motions that keep their speed, because of the structure of the loop.
-        span_s: Time over which the roots of a sampled loop were computed, in s. None if every
-            tick has the same delays.
+        drifting: Number of motions that keep their speed because of the structure of the loop.
+        span_s: Time over which the roots of a sampled loop were computed, in s, or None if
+            every tick has the same delays.
         repeats: True if the delays of a sampled loop repeat after this time.
-        deviation_per_s: Uncertainty of the rate due to delays that do not repeat, in 1/s. None
-            if they nearly repeat.
+        deviation_per_s: Uncertainty of the rate due to delays that do not repeat, in 1/s, or
+            None if they nearly repeat.
         is_continuous: True if the roots are those of the loop in continuous time.
-        has_mean_ages: True if ages that vary were replaced by their means.
+        has_mean_ages: True if varying ages were replaced by their means.
         reason: The reason why there are no roots. Empty if the loop was linearised.
     """
 
@@ -125,22 +125,22 @@ class LoopRoots(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for the user on the roots, or on the reason why there are no roots.
+        """A sentence for the user on the roots, or on why there are none.
 
-        The package `presentation` writes it.
+        The package `presentation` generates it.
         """
         return str(find_hook("describe a finding")(self))
 
     @property
     def leaves_out(self) -> str:
-        """A phrase on what the linearised loop leaves out. Empty if it contains everything.
+        """A phrase on what the linearised loop omits. Empty if it includes everything.
 
-        The package `presentation` writes it.
+        The package `presentation` generates it.
         """
         return str(find_hook("describe what roots leave out")(self))
 
     def to_json(self) -> JsonObject:
-        """Converts the roots to plain values for JSON, with the sentence about them."""
+        """Converts the roots to plain values for JSON, including the sentence about them."""
         return {
             "verdict": self.verdict,
             "rate_per_s": self.rate_per_s,
@@ -154,11 +154,11 @@ class LoopRoots(NamedTuple):
 
     @property
     def proven(self) -> str:
-        """The verdict on small motions about the final pose that the roots prove.
+        """The verdict on small motions about the final pose that is proven by the roots.
 
-        It is "stable" if the motions decay and "unstable" if they grow. Only exact roots prove
-        a verdict: those of a loop with its ticks and its repeating delays. Empty if the roots
-        are not exact.
+        The verdict is "stable" if the motions decay and "unstable" if they grow. Only exact
+        roots prove a verdict, which are those of a loop with its ticks and its repeating
+        delays. Empty if the roots are not exact.
         """
         return self.verdict if self.exact else ""
 
@@ -176,17 +176,17 @@ class LoopRoots(NamedTuple):
         """Measures how poorly the slow decay of the roots explains motion that seems to last.
 
         An oscillation is compared with the roots that oscillate, because another slow root does
-        not explain the oscillation, and a drift with the slowest root. The decay is compatible
-        in two cases: if the root halves the motion at most once in the judged part, because no
-        trend can then show the decay, or if |e| and |qd| have the rate of the root.
+        not explain it. A drift is compared with the slowest root. The decay is compatible with
+        the motion in two cases: if the root halves the motion at most once in the judged part,
+        too little for a trend to show, or if |e| and |qd| have the rate of the root.
 
         Args:
             end: How the motion ends.
 
         Returns:
-            A share without unit: at most 1 if the motion at the end may be the decay, infinity
-            if the roots are not numerical or not stable, or if the motion grows or is not
-            lasting.
+            A dimensionless misfit: at most 1 if the motion at the end may be the decay,
+                infinity if the roots are not numerical or not stable, or if the motion grows or
+                is not lasting.
         """
         is_swing = end.behaviour is EndBehaviour.BOUNDED
         is_lasting = is_swing or end.behaviour is EndBehaviour.DRIFTS
@@ -206,14 +206,14 @@ class LoopRoots(NamedTuple):
         return min(halvings, max(misfits))
 
     def measure_rate_misfit(self, measured_per_s: float) -> float:
-        """Measures how much a measured rate differs from that of the slowest root.
+        """Measures how far a measured rate deviates from that of the slowest root.
 
         Args:
             measured_per_s: The measured rate, in 1/s.
 
         Returns:
             The difference divided by its tolerance: at most 1 if the rates agree, infinity if
-            there is no root.
+                there is no root.
         """
         if self.rate_per_s is None:
             return math.inf
@@ -227,12 +227,12 @@ def _compute_rate_misfit(measured_per_s: float, root_per_s: float) -> float:
 
 
 class RunFindings(NamedTuple):
-    """All evidence on the stability of a run, from which `decide_stability` decides.
+    """All evidence on the stability of a run, the input of `decide_stability`.
 
     Attributes:
         end: How the motion ends.
-        twins: How small pushes in repeated runs develop. `None` if no run was repeated.
-        roots: Roots of the loop at the end of the run. `None` if they were not computed.
+        twins: How small pushes in repeated runs develop, or `None` if no run was repeated.
+        roots: Roots of the loop at the end of the run, or `None` if they were not computed.
         is_covered: True if the stability theorem proves the loop stable.
         law_proofs: Phrases that name the stability conditions of control laws that prove the
             loop stable.
@@ -257,21 +257,21 @@ class RunFindings(NamedTuple):
 
     @property
     def proven_by_roots(self) -> str:
-        """The verdict that the roots prove: "stable", "unstable", or empty if there is none."""
+        """The verdict proven by the roots: "stable", "unstable", or empty if there is none."""
         return "" if self.roots is None else self.roots.proven
 
 
 class StabilityDecision(NamedTuple):
-    """Decision whether a run of coupled arms is stable, with the evidence for it.
+    """The decision on whether a run of coupled arms is stable, with the evidence for it.
 
     Attributes:
         stability: The decision.
         findings: The evidence.
-        basis: Name of the evidence on which the decision rests.
+        basis: Name of the evidence on which the decision is based.
         obstacles: Names of the reasons that prevent a better decision. Empty if the run is
             stable.
-        advised_s: Length of a run that would show the decay of the slowest motion clearly, in
-            s. `None` if none is advised.
+        advised_s: Length of a run that would clearly show the decay of the slowest motion, in
+            s, or `None` if no longer run is advised.
     """
 
     stability: Stability
@@ -282,9 +282,9 @@ class StabilityDecision(NamedTuple):
 
     @property
     def rests_on(self) -> str:
-        """Phrase for the user that names the evidence of the decision. May be empty.
+        """A phrase for the user that names the evidence for the decision. May be empty.
 
-        The package `presentation` writes it.
+        The package `presentation` generates it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -292,17 +292,17 @@ class StabilityDecision(NamedTuple):
     def reasons(self) -> tuple[str, ...]:
         """Sentences on the reasons that prevent a better decision. Empty if the run is stable.
 
-        The package `presentation` writes them.
+        The package `presentation` generates them.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 
     @property
     def rests_on_roots_alone(self) -> bool:
-        """True if the decision rests on the exact roots of the loop, and on no other proof."""
+        """True if the decision is based on exact roots of the loop and on no other proof."""
         has_other_proof = self.findings.is_covered or bool(self.findings.law_proofs)
         return self.basis == "roots" or (self.basis == "proofs" and not has_other_proof)
 
     @property
     def is_too_short(self) -> bool:
-        """True if a better decision is prevented only by the length of the record."""
+        """True if only the length of the recording prevents a better decision."""
         return "short record" in self.obstacles

@@ -1,13 +1,13 @@
-"""Finds the time after which the network delays and the control periods of all arms repeat.
+"""Finds the time after which the network delays and the tick periods of all arms repeat.
 
 A stability analysis of a loop with changing delays covers one such period. For example, two
-sinusoidal delays with periods of 1.20 s and 1.21 s repeat together after 145.2 s, the least
-common multiple. A delay may also be constant, or follow a trace, which is a table of delays
-over time that is repeated from the start.
+sinusoidal delays with periods of 1.20 s and 1.21 s repeat together after 145.2 s, their least
+common multiple. A delay may also be constant, or follow a trace (a table of delays over time
+that restarts at its end).
 
 Invariant:
-    - Periods are computed in exact fractions of a second, so that no rounding error turns a
-      short period into a long one.
+    - Periods are computed as exact fractions of a second. A rounding error therefore cannot
+      turn a short period into a long one.
     - Random delays, measured delays, and traces that end have no period.
 """
 
@@ -64,8 +64,8 @@ def find_link_period_s(link: LinkBase) -> float | None:
         link: Delay model of the link.
 
     Returns:
-        The period. `None` if the delay is constant, random or measured, or follows a trace that
-        ends.
+        The period, or `None` if the delay is constant, random or measured, or follows a trace
+        that ends.
     """
     if is_ending_trace(link):
         return None
@@ -125,14 +125,14 @@ def _find_near_period_s(
     return float(spans_s[first_match])
 
 
-class _DelayPeriod(NamedTuple):
-    """The time after which all network delays and control periods repeat together.
+class DelayPeriod(NamedTuple):
+    """The time after which all network delays and tick periods repeat together.
 
     For example, a delay that alternates every 20 ms repeats after 40 ms. The exact stability
-    analysis of a sampled loop needs such a period.
+    analysis of a sampled loop requires such a period.
 
     Attributes:
-        true_s: The period, in s. `None` if some delay never repeats.
+        true_s: The period, in s, or `None` if some delay never repeats.
         span_s: A period that can be analysed, in s: the true period, or a shorter time after
             which the delays repeat to within half a tick. `None` if there is neither.
     """
@@ -148,38 +148,50 @@ class _DelayPeriod(NamedTuple):
         """
         return self.span_s is not None and self.span_s == self.true_s
 
+    @classmethod
+    def of_links(cls, links: Sequence[LinkBase], rates_hz: Sequence[int]) -> "DelayPeriod":
+        """Finds the period after which the delays of links and the ticks of sites repeat.
 
-def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> _DelayPeriod:
-    """Finds the period after which the delays of links and the ticks of sites repeat.
+        The true period is the least common multiple of the tick periods and of the periods of
+        all delays. If it is longer than `MAX_PERIOD_TICKS`, a shorter time is sought after
+        which the delays nearly repeat.
 
-    A tick is one period of a site's control loop. The true period is the least common multiple
-    of the ticks and of the periods of all delays. If the true period is longer than
-    `MAX_PERIOD_TICKS`, the function looks for a shorter time after which the delays nearly
-    repeat.
+        Args:
+            links: Delay models of the links.
+            rates_hz: Tick rate of each site, in Hz.
 
-    Args:
-        links: Delay models of the links.
-        rates_hz: Tick rate of each site.
+        Returns:
+            The period. Its attributes are `None` if a delay is random, or follows a trace that
+            ends.
+        """
+        for link in links:
+            if link.random or link.measured or is_ending_trace(link):
+                return cls(None, None)
+        cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
+        true_period = _find_common_period(cycles, math.gcd(*rates_hz))
+        true_s = float(true_period)
+        if true_s * max(rates_hz) <= MAX_PERIOD_TICKS:
+            return cls(true_s, true_s)
+        return cls(true_s, _find_near_period_s(cycles, rates_hz))
 
-    Returns:
-        The period. Its attributes are `None` if a delay is random, or follows a trace that
-        ends.
-    """
-    for link in links:
-        if link.random or link.measured or is_ending_trace(link):
-            return _DelayPeriod(None, None)
-    cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
-    true_period = _find_common_period(cycles, math.gcd(*rates_hz))
-    true_s = float(true_period)
-    if true_s * max(rates_hz) <= MAX_PERIOD_TICKS:
-        return _DelayPeriod(true_s, true_s)
-    return _DelayPeriod(true_s, _find_near_period_s(cycles, rates_hz))
+    @classmethod
+    def of_scenario(cls, scenario: Scenario) -> "DelayPeriod":
+        """Finds the time after which all delays and tick periods repeat at the end of a run.
+
+        Delay models and rates that the scenario replaces before the end are ignored.
+
+        Args:
+            scenario: The scenario.
+        """
+        links = [find_final_link(scenario, name) for name in scenario.links]
+        rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
+        return cls.of_links(links, rates_hz)
 
 
 def is_ending_trace(link: LinkBase) -> bool:
-    """Returns True if a link plays a delay trace that does not start again at its end.
+    """Returns True if a link plays a delay trace that does not restart at its end.
 
-    The delay after this end is not a repetition, so the link has no period.
+    The delay after the end is not a repetition, so the link has no period.
 
     Args:
         link: Delay model of the link.
@@ -188,12 +200,13 @@ def is_ending_trace(link: LinkBase) -> bool:
 
 
 def find_final_link(scenario: Scenario, name: str) -> LinkBase:
-    """Returns the delay model of a link that is in force at the end of a scenario.
+    """Returns the delay model of a link in effect at the end of a scenario.
 
-    The linear analysis of a run uses this model, because it concerns the final pose.
+    The linear analysis of a run uses this model, because it describes motion about the final
+    pose.
 
     Args:
-        scenario: Description of the experiment. Its timeline may change the link.
+        scenario: The scenario. Its timeline may change the link.
         name: Name of the link, for example "m1->s".
     """
     end_ns = round(scenario.duration_s * 1e9)
@@ -203,32 +216,20 @@ def find_final_link(scenario: Scenario, name: str) -> LinkBase:
     return link
 
 
-def find_final_delay_period(scenario: Scenario) -> _DelayPeriod:
-    """Finds the time after which all delays and control periods repeat at the end of a run.
-
-    Models and rates that the scenario replaces before the end do not count.
-
-    Args:
-        scenario: Description of the experiment.
-    """
-    links = [find_final_link(scenario, name) for name in scenario.links]
-    rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
-    return find_delay_period(links, rates_hz)
-
-
 def find_burst_interval_s(scenario: Scenario) -> float | None:
-    """Finds the mean time from one burst of lost samples to the next, in s.
+    """Finds the mean time between two bursts of lost samples, in s.
 
     Bursts follow the Gilbert-Elliott model: a sample that arrives may be followed by a burst,
-    in which a share `loss_bad` of the samples is lost. If a sample leaves a burst with the
-    probability r, the mean burst has 1 / r samples, which are `loss` / `loss_bad` of all.
+    in which a fraction `loss_bad` of the samples is lost. If a sample leaves a burst with
+    probability r, the mean burst has 1 / r samples, and bursts contain the fraction `loss` /
+    `loss_bad` of all samples.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
 
     Returns:
-        The longest of these times over all link models that are in force at the end of the
-        scenario. `None` if no link loses samples in bursts.
+        The longest of these times over all link models in effect at the end of the scenario, or
+        `None` if no link loses samples in bursts.
     """
     intervals_s = []
     for name in scenario.links:

@@ -1,17 +1,16 @@
-"""Computes the weights with which arms follow each other, and the energy weights of the arms.
+"""Computes the dominance factors over time, and the energy weights of the arms.
 
 A slave may follow two masters, for example with weights 0.7 and 0.3, and these weights may
-change during the run, at once or in a ramp. The weight with which arm i follows arm j is called
-the dominance factor alpha_ij. Analyses need the factors at every time, which `DominanceHistory`
-gives.
+change during the run, suddenly or along a ramp. The weight with which arm i follows arm j is
+called the dominance factor alpha_ij. `DominanceHistory` contains the factors at all times.
 
 The stability proof uses a weighted sum of the energies of all arms. The weight of arm i is
 
     beta_i = pi_i / c_i
 
-Here pi is the left eigenvector of the matrix alpha for the eigenvalue 1 (the Perron vector),
-and c_i is the factor by which the damping gain of arm i differs from that of the first arm.
-Without these weights the proof does not hold (docs/theory/errata-proof.md).
+where pi is the left eigenvector of the matrix alpha for the eigenvalue 1 (the Perron vector),
+and c_i is the ratio of the damping gain of arm i to that of the first arm. Without these
+weights the proof does not hold (docs/theory/errata-proof.md).
 
 Invariant:
     - The factors depend only on time and on the changes that were carried out.
@@ -34,15 +33,14 @@ rounded.
 
 
 class DominanceHistory(NamedTuple):
-    """Weights (dominance factors) over time with which an arm follows each of P other arms.
+    """The dominance factors over time with which an arm follows each of its P peers.
 
-    A factor lies between 0 and 1. The other arms (peers) are in scenario order.
+    A factor lies between 0 and 1. The peers are in scenario order.
 
     Attributes:
         alpha: Factors at every row, shape (K, P).
-        rate: Their time derivatives as the controller takes them into account, shape (K, P), in
-            1/s.
-        before: Factors at the end of every tick period, before they change in a step there,
+        rate: Their time derivatives as used by the controller, shape (K, P), in 1/s.
+        before: Factors at the end of every tick period, just before any sudden change there,
             shape (K - 1, P).
     """
 
@@ -52,21 +50,29 @@ class DominanceHistory(NamedTuple):
 
     @property
     def constant(self) -> bool:
-        """True if no dominance factor changes during the run.
-
-        A dominance factor is the weight, from 0 to 1, with which one arm follows another.
-        """
+        """True if no dominance factor changes during the run."""
         has_steps = bool(np.any(self.alpha != self.alpha[0]))
         has_ramps = bool(self.rate.any())
         return not has_steps and not has_ramps
 
     @classmethod
+    def of_scenario(cls, scenario: Scenario, site: str, t_s: Array) -> "DominanceHistory":
+        """Returns the dominance factors that the scenario plans for a site.
+
+        Args:
+            scenario: The scenario.
+            site: Name of the site.
+            t_s: Ascending times, one tick period apart, shape (K,), in s.
+        """
+        return DominancePlan.of_scenario(scenario, site).evaluate(t_s)
+
+    @classmethod
     def of_log(cls, log: Log, site: str, t_s: Array) -> "DominanceHistory":
-        """Returns the dominance factors of a site at successive ticks.
+        """Returns the dominance factors of a site at consecutive ticks of a run.
 
         The factors change according to the timeline of the scenario and the commands during the
-        run. If the site lost a peer and continues without it, the factors of the others are
-        scaled so that their sum is 1.
+        run. If the site lost a peer and continued without it, the remaining factors are scaled
+        to add up to 1.
 
         Args:
             log: The log of the run.
@@ -74,10 +80,10 @@ class DominanceHistory(NamedTuple):
             t_s: Times of the ticks, shape (K,), in s.
 
         Raises:
-            LogError: A record names a change that is not valid.
+            LogError: A record names an invalid change.
         """
         history = DominancePlan.of_log(log, site).evaluate(t_s)
-        is_present = ~find_lost_peers(log, site, t_s)
+        is_present = ~_find_lost_peers(log, site, t_s)
         if is_present.all():
             return history
 
@@ -96,18 +102,35 @@ class DominanceHistory(NamedTuple):
             before=before / total_before,
         )
 
+    @classmethod
+    def list_ramp_spans_s(cls, log: Log, site: str) -> list[tuple[float, float]]:
+        """Lists the start and end of each ramp of a site's dominance factors, in s.
+
+        The slopes of the factors change only at these times, as long as no peer is lost. Start
+        and end are equal for a sudden change.
+
+        Args:
+            log: The log of the run.
+            site: Name of the site.
+
+        Raises:
+            LogError: A recorded change is invalid.
+        """
+        ramps = DominancePlan.of_log(log, site).ramps
+        return [(ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps]
+
 
 class DominancePlan(NamedTuple):
-    """Changes of the weights (dominance factors) with which a site follows its P peers.
+    """Changes of the dominance factors with which a site follows its P peers.
 
-    Every change is a ramp from the old to the new factors. A sudden change is a ramp without
-    length. A ramp that begins while another one is in progress starts from the values reached
-    at that time.
+    Every change is a ramp from the old to the new factors, and a sudden change is a ramp of
+    zero length. A ramp that begins while another one is in progress starts from the values
+    reached at that time.
 
     Attributes:
         start: Factors at the start of the session, shape (P,).
         ramps: Changes of the factors.
-        h_s: The tick period of the site, in s.
+        h_s: Tick period of the site, in s.
     """
 
     start: Array
@@ -119,7 +142,7 @@ class DominancePlan(NamedTuple):
         """Returns the changes of dominance factors that the scenario plans for a site.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
             site: Name of the site.
         """
         factors = scenario.dominance[site]
@@ -129,14 +152,14 @@ class DominancePlan(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log, site: str) -> "DominancePlan":
-        """Returns the planned changes of a run and those that commands requested.
+        """Returns the planned changes of a run together with those requested by commands.
 
         Args:
             log: The log of the run.
             site: Name of the site.
 
         Raises:
-            LogError: A recorded change is not valid.
+            LogError: A recorded change is invalid.
         """
         plan = cls.of_scenario(log.scenario, site)
         for changes in log.commands(site).values():
@@ -146,10 +169,10 @@ class DominancePlan(NamedTuple):
     def drop_finished(self, from_s: float) -> "DominancePlan":
         """Removes changes that were complete before a given time.
 
-        The start factors are changed so that the factors from this time on stay the same.
+        The initial factors are adjusted to leave the factors from this time on unchanged.
 
         Args:
-            from_s: Time from which the factors must stay the same, in s.
+            from_s: Time from which the factors must remain the same, in s.
         """
         sorted_ramps = sorted(self.ramps, key=lambda ramp: ramp.start_ns)
         started = sum(ramp.start_ns * 1e-9 <= from_s for ramp in sorted_ramps)
@@ -164,7 +187,7 @@ class DominancePlan(NamedTuple):
         return self._replace(start=history.alpha[0], ramps=remaining)
 
     def evaluate(self, t_s: Array) -> DominanceHistory:
-        """Computes the dominance factors over time, as the simulation does.
+        """Computes the dominance factors over time in the same way as the simulation.
 
         Args:
             t_s: Ascending times, one tick period apart, shape (K,), in s.
@@ -208,7 +231,7 @@ class DominancePlan(NamedTuple):
         return DominanceHistory(alpha, rate, at_period_ends)
 
 
-def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
+def _find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     """Finds the times at which an arm continued without another arm whose messages had stopped.
 
     An arm counts as lost if no message from it arrived for some time, see `core.lost_peers`.
@@ -240,10 +263,9 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
 
 
 class PeerLoss(NamedTuple):
-    """Interval of time in which an arm continued without another arm whose messages stopped.
+    """Time interval in which a site continued without a peer whose samples had stopped.
 
-    The arm then follows the remaining arms alone, which changes its dominance factors, the
-    weights with which it follows them.
+    The site then follows only the remaining peers, which changes its dominance factors.
 
     Attributes:
         site: Name of the site.
@@ -259,21 +281,21 @@ class PeerLoss(NamedTuple):
 
     @classmethod
     def list_of_log(cls, log: Log) -> "list[PeerLoss]":
-        """Lists the times in which sites continued without a peer whose messages had stopped.
+        """Lists the time intervals in which sites continued without a lost peer.
 
-        In these times the dominance factors differ from the planned ones, because a site
+        In these intervals the dominance factors differ from the planned ones, because a site
         distributes the share of the lost peer among the others.
 
         Args:
             log: The log of the run.
 
         Returns:
-            The spans of time, ordered by site and peer. Empty if no peer was lost.
+            The intervals, ordered by site and peer. Empty if no peer was lost.
         """
         losses = []
         for site in log.sites:
             site_log = log[site]
-            is_lost = find_lost_peers(log, site, site_log.t_s)
+            is_lost = _find_lost_peers(log, site, site_log.t_s)
             lost = is_lost.astype(int)
             times_s = site_log.t_s
             if len(site_log):
@@ -318,18 +340,18 @@ class _LyapunovWeights(NamedTuple):
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
+    """Finds the ratio of each arm's damping gain Kd to the gain of the first arm.
 
-    The stability proof allows arms with different gains if all joints have the same ratio,
-    because the weights of the arms in V then compensate for the ratio.
+    The stability proof allows arms with different gains if the ratio is the same for all
+    joints, because the weights of the arms in V then compensate for it.
 
     Args:
         Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an
             arm does not follow.
 
     Returns:
-        The ratios, shape (N,). All are 1 if all gains are zero. `None` if the gains of the arms
-        are not multiples of each other.
+        The ratios, shape (N,), or `None` if the gains of the arms are not multiples of each
+        other. All ratios are 1 if all gains are zero.
     """
     if not np.nan_to_num(Kd).any():
         return np.ones(len(Kd))
@@ -352,11 +374,10 @@ def find_kd_scales(Kd: Array) -> Array | None:
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
     """Computes the weight of each site in the energy function of the stability proof.
 
-    A site is the process that runs one arm. The weight of site i is beta_i = pi_i / c_i, where
-    pi is the left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between
-    the damping gain of site i and that of the first site. The weights are scaled so that their
-    sum is N. If the gains are not multiples of each other, c_i = 1 is used, and the energy may
-    rise.
+    The weight of site i is beta_i = pi_i / c_i, where pi is the left eigenvector of `alpha` for
+    the eigenvalue 1, and c_i is the ratio of the damping gain of site i to that of the first
+    site. The weights are scaled to sum to N. If the gains are not multiples of each other, c_i
+    = 1 is used, and the energy may rise.
 
     Args:
         alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,

@@ -1,13 +1,14 @@
-"""Gives an overview of recorded files, and summarises recorded runs.
+"""Describes the content of recorded files, and summarises recorded runs.
 
-`info` lists the content of any MCAP file: its layout, its channels, missing messages, and
-message rates. For a log of this program it adds how well the control loops, the network links
-and the clocks worked. `summarise_run` computes the content of the file `summary.json` of a run.
+`info` describes any MCAP file: its layout, its channels, missing messages, and message rates.
+For a log of this program it also reports how well the control loops, the network links and the
+clocks worked. `summarise_run` computes the content of the file `summary.json` of a run.
 
 Invariant:
-    - The channels and messages are listed without decoding any message. Therefore the list
-      works for any MCAP file. If a log cannot be opened, the overview states the reason.
-    - Missing messages are counted only in channels whose messages have consecutive numbers.
+    - The channels and messages are listed without decoding any message, which works for any
+      MCAP file. If a log cannot be opened, the overview states the reason.
+    - Missing messages are counted only in channels whose messages have consecutive sequence
+      numbers.
     - Keys end in their unit. A quantity that the log does not determine is `None`, never NaN.
     - A run is never executed again for its summary.
 """
@@ -79,13 +80,14 @@ class FileInventory:
 
     Args:
         paths: The files.
-        progress: Function that is called with the number of bytes read so far and with the
-            total number of bytes.
+        progress: Function that is called with the number of bytes read so far and the total
+            number of bytes.
 
     Attributes:
         files: Size, compression, damage and other facts of every file, with keys that end in
             their unit.
-        metadata: Metadata records of all files, by name. A later file replaces an earlier one.
+        metadata: Metadata records of all files, keyed by name. A later file overrides an
+            earlier one.
 
     Raises:
         LogError: A file cannot be read, or is not an MCAP file.
@@ -151,11 +153,11 @@ class FileInventory:
         """Describes the messages in each channel (topic) of the files, for `trilat log info`.
 
         Args:
-            log: The files as a log, of which missing messages are counted. `None` if they are
-                not a log.
+            log: The files opened as a log, whose missing messages are then counted, or `None`
+                if they are not a log.
 
         Returns:
-            Plain values by topic.
+            A mapping from topic to plain values.
         """
         topics_in_order = dict.fromkeys([*self._formats, *self._messages])
         channels = {}
@@ -221,7 +223,7 @@ def _describe_gaps(log: Log | None, topic: str, sequence: Sequence[int]) -> Json
 class FileOverview(Result):
     """Overview of one or several recorded MCAP files, returned by `info`.
 
-    A log that was recorded in several files is described as a whole.
+    A log that was recorded in several files is described as one.
 
     Attributes:
         facts: The overview as plain values. The keys are those of `trilat log info --json`.
@@ -230,7 +232,7 @@ class FileOverview(Result):
     facts: JsonObject
 
     def headline(self) -> str:
-        """One line with the paths of all files and the number of messages, for the user.
+        """One line for the user with the paths of all files and the number of messages.
 
         An example is "run.mcap: 120345 messages".
         """
@@ -243,15 +245,15 @@ class FileOverview(Result):
     def to_dict(self) -> JsonObject:
         """Returns the content of the files, with the keys of `trilat log info --json`.
 
-        For example, the entry "channels" has the number of messages of each channel by its
-        topic.
+        For example, the entry "channels" maps each topic to facts such as its number of
+        messages.
         """
         return self.facts
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns the channels of the file as a table, one row for each.
+        """Returns the channels of the file as a table, with one row per channel.
 
-        A row contains the topic and all facts about the channel, such as its number of
+        Each row contains the topic and all facts about the channel, such as its number of
         messages.
         """
         return [
@@ -262,9 +264,9 @@ class FileOverview(Result):
 def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
     """Returns the content of an MCAP file, or of the parts of one log.
 
-    `trilat log info` shows the same. The key `kind` is "trilat" for a log of this program that
-    could be opened. Otherwise `kind` is "mcap", and `problem` states why the log could not be
-    opened if the file looks like a log of this program.
+    `trilat log info` shows the same content. The key `kind` is "trilat" for a log of this
+    program that could be opened, and "mcap" otherwise. If the file looks like a log of this
+    program but cannot be opened, `problem` states why.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
     >>> tn.info(path).to_dict()["sites"]["m"]["records"]
@@ -272,7 +274,7 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
 
     Args:
         files: The file, or the parts of one log.
-        progress: Function that is called with the amount of work done so far and with the total
+        progress: Function that is called with the amount of work done so far and the total
             amount.
 
     Raises:
@@ -283,15 +285,15 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
     def report_pass(number: int) -> Progress | None:
         """Returns a function that reports the progress of one of two passes over the files.
 
-        `info` reads the files twice. Both passes together are shown as one progress from 0 to
-        1.
+        `info` reads the files twice. The two passes are combined into one progress value from 0
+        to 1.
 
         Args:
             number: 0 for the first pass, which covers the first half of the progress, 1 for the
                 second.
 
         Returns:
-            The function. `None` if the caller of `info` requests no progress reports.
+            The function, or `None` if the caller of `info` does not want progress reports.
         """
         if progress is None:
             return None
@@ -397,16 +399,16 @@ def _describe_session(log: Log) -> JsonObject:
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Collects facts on the completeness of an arm's records and the timing of its loop.
+    """Describes how complete the records of a site are and how punctual its loop was.
 
-    The timing is `None` in a simulation, in which no clock is read.
+    The timing is `None` in a simulation, which reads no clock.
 
     Args:
         log: The log of the run.
         site: Name of the site.
 
     Returns:
-        The facts as plain values, ready for JSON.
+        Plain values, ready for JSON.
     """
     site_log = log[site]
     spec = log.scenario.sites[site]
@@ -528,15 +530,16 @@ def _parse_number(text: str) -> int | None:
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
     """Collects the most important quantities of a run, for the file `summary.json`.
 
-    The log may be torn, short or empty. Quantities that the log does not determine are `None`.
+    The log may be truncated, short or empty. Quantities that the log does not determine are
+    `None`.
 
     Args:
         log: The log of the run.
-        twin: Log of the same run without operators, from which the effect of the operators is
-            computed. `None` if there is no such log.
+        twin: Log of the same run without operators, used to compute the effect of the
+            operators, or `None` if there is no such log.
 
     Returns:
-        The quantities as plain values, ready for JSON.
+        Plain values, ready for JSON.
     """
     sites = {site: _summarise_site(log, site, twin) for site in log.sites}
     settling_times_s = [site["settle_s"] for site in sites.values()]

@@ -1,17 +1,18 @@
-"""Computes the reference motion that an arm should make to follow other arms, for many records.
+"""Computes the reference motion with which an arm follows other arms, for many records.
 
 Arms follow each other either joint by joint (`JointFollowing`), or with their end effectors
-(`TaskFollowing`). Both classes compute the error e, the difference between the position of the
-arm and the position that it follows, and the joint velocities that reduce e. The simulation
-computes the same motion in compiled code. This second implementation in NumPy, from the
-equations of docs/reference/task-space.md, makes the stability certificate independent of it.
+(`TaskFollowing`). Both classes compute the error e (the difference between the position of the
+arm and its reference), and the joint velocities that reduce e. The simulation computes the same
+motion in compiled code. This module is an independent implementation in NumPy, from the
+equations of docs/reference/task-space.md, so the stability certificate does not depend on the
+simulation.
 
 Invariant:
     - Directions of space in which the end effector does not follow have no effect.
     - Near a singular pose of the arm, the inverse of the Jacobian J is damped. The end effector
       then does not reach the velocity -Lambda e, where Lambda is a gain in 1/s. The joint
-      velocity v satisfies J v = -Lambda e - d y. Here d is the damping, y solves (J J' + d) y =
-      -Lambda e - J p, and p is the velocity of the joints towards a preferred posture.
+      velocity v satisfies J v = -Lambda e - d y, where d is the damping, y solves (J J' + d) y
+      = -Lambda e - J p, and p is the joint velocity towards a preferred posture.
 """
 
 from collections.abc import Callable
@@ -43,7 +44,7 @@ def find_task_reference(
         a = psi' + Jd' y + J' y',     A y' = -Lambda ed - Jd v - J (psi' + Jd' y)
 
     psi is a velocity towards a preferred posture, e the error of the end effector and ed its
-    derivative. A' in the first line of each formula stands for the transposed matrix.
+    derivative. J' and Jd' are transposed matrices, psi' and y' time derivatives.
 
     Args:
         J: Jacobian of the followed axes, shape (m, n, ...).
@@ -71,9 +72,9 @@ def find_task_reference(
 class JointFollowing(NamedTuple):
     """Converts errors to motion and torque for a site that follows joint by joint.
 
-    Its coordinates are the joint angles. Therefore every function is a product with a gain, or
-    the identity. `TaskFollowing` has the same methods for sites that follow with the end
-    effector. In all methods `rows` selects the K rows of the records that are evaluated.
+    Its coordinates are the joint angles, so every method merely multiplies by a gain, or
+    returns its input. `TaskFollowing` has the same methods for sites that follow with the end
+    effector. In all methods, `rows` selects the K rows of the records to evaluate.
 
     Attributes:
         Lambda: Gain of the synchronisation error e, shape (n,), in 1/s.
@@ -89,13 +90,11 @@ class JointFollowing(NamedTuple):
     ) -> tuple[Array, Array]:
         """Returns the joint velocity that should reduce the errors, and its derivative.
 
-        The velocity is -Lambda e, with the error e of the joints and the gain Lambda, in 1/s.
+        The velocity is -Lambda e, with the joint error e and the gain Lambda in 1/s.
 
         Args:
-            rows: Rows of the records. They have no effect, because the result does not depend
-                on the pose.
-            e: Differences between the joint angles and the angles that the arm follows, shape
-                (K, n), in rad.
+            rows: Rows of the records. Ignored, because the result does not depend on the pose.
+            e: Differences between the joint angles and their reference, shape (K, n), in rad.
             ed: Derivatives of the errors, shape (K, n), in rad/s.
 
         Returns:
@@ -105,25 +104,24 @@ class JointFollowing(NamedTuple):
         return -self.Lambda * e, -self.Lambda * ed
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:  # noqa: ARG002
-        """Returns the jump of the filtered error r when a new message of another arm is used.
+        """Returns the jump of the filtered error r when a new sample of a peer comes into use.
 
-        The error e jumps by de. As r = qd + Lambda e, the jump is Lambda de, shape (K, n).
+        The error e jumps by de. Since r = qd + Lambda e, the jump of r is Lambda de, shape (K,
+        n).
 
         Args:
-            rows: Rows of the records. Not needed here, because the result does not depend on
-                the pose.
+            rows: Rows of the records. Ignored, because the result does not depend on the pose.
             de: Jumps of e, shape (K, n), in rad.
         """
         return self.Lambda * de
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:  # noqa: ARG002
-        """Returns the joint torque of a force along the shared coordinates, shape (K, n).
+        """Returns the joint torque for a force along the shared coordinates, shape (K, n).
 
-        The shared coordinates are the joint angles here. Therefore the force is the torque.
+        Here the shared coordinates are the joint angles, so the force is the torque.
 
         Args:
-            rows: Rows of the records. Not needed here, because the result does not depend on
-                the pose.
+            rows: Rows of the records. Ignored, because the result does not depend on the pose.
             force: Generalised force, shape (K, n), in N m.
         """
         return force
@@ -131,9 +129,8 @@ class JointFollowing(NamedTuple):
     def without_posture(self) -> "JointFollowing":
         """Returns this object unchanged.
 
-        `TaskFollowing` needs this method to leave out the motion towards a preferred posture.
-        An arm that follows joint by joint has no free joints, and therefore no preferred
-        posture.
+        `TaskFollowing` uses this method to exclude the motion towards a preferred posture. An
+        arm that follows joint by joint has no free joints, and therefore no preferred posture.
         """
         return self
 
@@ -144,11 +141,11 @@ class JointFollowing(NamedTuple):
     ) -> tuple[Array, Array]:
         """Returns two arrays of zeros, because no motion is damped near singular poses here.
 
-        Singular poses matter only for arms that follow with their end effectors, see
-        `TaskFollowing`.
+        Singular poses matter only to arms that follow with their end effectors (see
+        `TaskFollowing`).
 
         Args:
-            rows: Rows of the records. They have no effect.
+            rows: Rows of the records. Ignored.
             e: Synchronisation errors of the joints, shape (K, n), in rad.
 
         Returns:
@@ -162,10 +159,10 @@ class JointFollowing(NamedTuple):
 class TaskFollowing:
     """Converts errors to motion and torque for a site that follows with its end effector.
 
-    The arm has n joints, and its end effector follows along some of the m coordinates of the
-    task. Joints that the task leaves free move towards a preferred posture. Near singular
-    poses, where the end effector cannot move in some direction, the inverse of the Jacobian is
-    damped. Arrays have a row for each of the K records.
+    The arm has n joints, and its end effector follows along some of the m task coordinates.
+    Joints that the task leaves free move towards a preferred posture. Near singular poses,
+    where the end effector cannot move in some direction, the inverse of the Jacobian is damped.
+    Arrays have one row for each of the K records.
 
     Attributes:
         Lambda: Gain of the error, shape (m,), in 1/s. 0 along an axis that the site does not
@@ -177,8 +174,8 @@ class TaskFollowing:
         inverse: Inverse of J J' + damping, shape (K, m, m).
         damping: Damping near singular poses, shape (K,), in m^2.
         damping_rate: Derivative of the damping, shape (K,), in m^2/s.
-        least: Lower bound of the least singular value of J, from which the damping is computed,
-            shape (K,), in m.
+        least: Lower bound on the smallest singular value of J, from which the damping is
+            computed, shape (K,), in m.
     """
 
     Lambda: Array
@@ -199,13 +196,10 @@ class TaskFollowing:
     def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
         """Returns the joint velocity with which the end effector should reduce its error.
 
-        The end effector is the tip of the arm. The arm follows other arms with this tip, and
-        not joint by joint.
-
         Args:
             rows: Rows of the records whose pose is used.
-            e: Differences between the position of the end effector and the position that it
-                follows, shape (K, m) for m coordinates.
+            e: Differences between the position of the end effector and its reference, shape (K,
+                m) for m coordinates.
             ed: Derivatives of the errors, shape (K, m).
 
         Returns:
@@ -228,11 +222,11 @@ class TaskFollowing:
         return v.T, a.T
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:
-        """Returns how much the filtered error r jumps when the error of the end effector jumps.
+        """Returns the jump of the filtered error r when the error of the end effector jumps.
 
-        The filtered error r is the joint velocity minus its reference. Errors jump when a new
-        state of another arm arrives. The jump of r is the damped inverse of the Jacobian times
-        Lambda times the jump of the error, with the gain Lambda in 1/s.
+        Errors jump when a new sample of a peer arrives. The filtered error r is the joint
+        velocity minus its reference. Its jump is the damped inverse of the Jacobian, times the
+        gain Lambda in 1/s, times the jump of the error.
 
         Args:
             rows: Rows of the records whose pose is used.
@@ -245,10 +239,10 @@ class TaskFollowing:
         return self.compute_joint_torque(rows, y)
 
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:
-        """Returns the joint torque J'f that acts like a force f at the end effector (tip).
+        """Returns the joint torque J'f equivalent to a force f at the end effector, in N m.
 
-        J is the Jacobian, from joint velocities to the velocity of the tip. The shape is (K,
-        n), in N m.
+        J is the Jacobian, which maps joint velocities to the velocity of the end effector. The
+        shape is (K, n).
 
         Args:
             rows: Rows of the records whose pose is used.
@@ -258,7 +252,7 @@ class TaskFollowing:
         return torque
 
     def project_torque(self, torque: Array) -> Array:
-        """Returns the force at the end effector (tip) that corresponds to a joint torque, in N.
+        """Returns the force at the end effector that corresponds to a joint torque, in N.
 
         `compute_joint_torque` is the reverse conversion.
 
@@ -274,19 +268,19 @@ class TaskFollowing:
     def without_posture(self) -> "TaskFollowing":
         """Returns a copy in which the arm does not move its free joints to a preferred posture.
 
-        An arm may have more joints than the task needs. The reference velocity is then linear
-        in the error of the end effector.
+        An arm may have more joints than the task needs. In the copy, the reference velocity is
+        linear in the error of the end effector.
         """
         still = np.zeros_like(self.psi)
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns how much the damping near singular poses violates two equations of the proof.
+        """Returns how far the damping near singular poses violates two equations of the proof.
 
-        Without damping, the equations J r = xd + Lambda e and a = dv/dt hold exactly. Here J is
-        the Jacobian, r the filtered error, xd the velocity of the end effector, e its error and
-        Lambda a gain. The reference velocity of the joints is v, and a is the acceleration that
-        the control law uses for dv/dt. Away from singular poses the result is zero.
+        Without damping, the equations J r = xd + Lambda e and a = dv/dt hold exactly. J is the
+        Jacobian, r the filtered error, xd the velocity of the end effector, e its error, Lambda
+        a gain, v the reference velocity of the joints, and a the acceleration that the control
+        law uses for dv/dt. Away from singular poses, both results are zero.
 
         Args:
             rows: Rows of the records whose pose is used.
@@ -324,11 +318,9 @@ def build_following(
 ) -> Following:
     """Returns the object that computes how an arm moves its joints to follow other arms.
 
-    An arm follows either joint by joint or with its end effector (tip).
-
     Args:
-        arm: The arm. If the arm has a task for its end effector, it follows with the end
-            effector.
+        arm: The arm. If it has a task for its end effector, it follows with the end effector,
+            and otherwise joint by joint.
         q: Joint angles in K records, shape (K, n) for n joints, in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
         Lambda: Gain of the error in 1/s, shape (n,). If the arm follows with its end effector,

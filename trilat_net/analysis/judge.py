@@ -1,14 +1,14 @@
 """Decides whether a recorded or simulated run is stable, from all available evidence.
 
-All commands of the program call this module and therefore reach the same decision.
-`certify_run` judges the log of a run by three kinds of evidence: the energy function V of the
-stability proof, repetitions of the run with small disturbances (twins), and the characteristic
-roots of the linearised control loop. `judge_virtual_run` judges a simulated run without a log,
-for example one run of a parameter sweep. To save computing time, it computes V only if V may
-change the decision.
+All commands of the program use this module and therefore reach the same decision. `certify_run`
+judges the log of a run from three kinds of evidence: the energy function V of the stability
+proof, repetitions of the run with small disturbances (twins), and the characteristic roots of
+the linearised control loop. `judge_virtual_run` judges a simulated run without a log, such as
+one run of a parameter sweep. To save computing time, it computes V only if V may change the
+decision.
 
 Invariant:
-    - All commands decide by `analysis.stability_decision.decide_stability`, with roots from
+    - All commands decide with `analysis.stability_decision.decide_stability`, using roots from
       `loop_roots`.
 """
 
@@ -19,15 +19,14 @@ import msgspec
 
 from ..execution import FusedRun, SimulatedLog, simulate_columns
 from ..log import MIN_COVERAGE, Log
-from ..scenario import Scenario, describe_law_conditions, list_law_situations
+from ..scenario import Scenario
 from .blas_threads import limit_blas_threads
-from .certificate.certificate_result import Certificate
-from .certificate.observed_energy import find_energy_laws
+from .certificate.observed_energy import ObservedEnergy
 from .certificate.premise_quantities import MissingFunctional
-from .certificate.stability_certificate import certify_log
+from .certificate.stability_certificate import Certificate
 from .decision_facts import LoopRoots, RunFindings, StabilityDecision
 from .delay_period import find_final_link
-from .run_end import RunEnd, RunTrace, Stability
+from .run_end import RunEnd, Stability
 from .run_remarks import RunCircumstances
 from .stability_decision import decide_stability, is_decided_by_roots
 from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
@@ -36,23 +35,23 @@ from .twins.twin_growth import TwinGrowth
 
 
 def list_law_proofs(scenario: Scenario) -> list[str]:
-    """Lists the stability conditions of control laws that prove that all motions die away.
+    """Lists the stability conditions of control laws that prove that all motions decay.
 
-    The conditions are evaluated for the delays and dominance factors (the weights with which
-    arms follow each other) at the end of the scenario.
+    The conditions are evaluated for the delays and dominance factors at the end of the
+    scenario.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
 
     Returns:
-        A phrase per condition. Empty unless the condition of every site holds and is a proof.
+        One phrase per condition. Empty unless the condition of every site holds and is a proof.
     """
     if any(change.dominance for change in scenario.timeline):
         return []
     links = {name: find_final_link(scenario, name) for name in scenario.links}
     final_scenario = msgspec.structs.replace(scenario, links=links, timeline=())
     proofs = []
-    for _, law, situation in list_law_situations(final_scenario):
+    for _, law, situation in final_scenario.law_situations():
         condition = law.condition(situation)
         if condition is None or not condition.proves_decay:
             return []
@@ -68,24 +67,23 @@ def certify_run(
     own_laws: bool = False,
     twins: int | None = None,
 ) -> Certificate:
-    """Certifies whether a recorded run was stable, with all available checks.
+    """Certifies whether a recorded run was stable, using all available checks.
 
-    In addition to the checks of `certify_log`, the run is repeated with small pushes, which
-    shows whether disturbances grow. The characteristic roots of the coupled arms are computed
-    at the end pose.
+    In addition to the checks of `Certificate.of_log`, the run is repeated with small pushes,
+    which shows whether disturbances grow. The characteristic roots of the coupled arms are
+    computed at the final pose.
 
     Args:
         log: The log of the run.
-        min_coverage: Least fraction of the ticks (periods of the control loop) of each arm's
-            process that must be recorded.
+        min_coverage: Smallest acceptable fraction of recorded ticks at each site.
         own_laws: True if the code of users' control laws may be executed.
-        twins: Number of repeated runs with a push. `None` for one push of every joint, 0 for no
+        twins: Number of repeated runs with a push. `None` for one push per joint, 0 for no
             repetition.
 
     Raises:
-        LogError: A record cannot be read, or contains a change that is not valid.
+        LogError: A record cannot be read, or contains an invalid change.
     """
-    certificate = certify_log(log, min_coverage=min_coverage, own_laws=own_laws)
+    certificate = Certificate.of_log(log, min_coverage=min_coverage, own_laws=own_laws)
 
     growth = None
     if twins != 0:
@@ -93,7 +91,7 @@ def certify_run(
 
     final_scenario = resolve_final_scenario(log)
     roots = find_log_roots(log, own_laws=own_laws)
-    conditions = describe_law_conditions(final_scenario, ticks_grow=roots.is_refutation)
+    conditions = final_scenario.describe_law_conditions(ticks_grow=roots.is_refutation)
 
     return replace(
         certificate,
@@ -139,10 +137,10 @@ def judge_virtual_run(
 ) -> _VirtualJudgement:
     """Judges a simulated run as its certificate would, without a log.
 
-    Twins, one for every joint, are executed only if they may change the decision. The run is
-    repeated with all its records only if it has settled or is open, if its laws have an energy
-    function V or declare energies, and if it has at most `MAX_RECORDED_TICKS` ticks. Energies
-    need the records, and may prove that the run is stable, or contradict that it settled.
+    Twins, one per joint, are executed only if they may change the decision. The run is repeated
+    with all its records only if it has settled or is open, if its laws have an energy function
+    V or declare energies, and if it has at most `MAX_RECORDED_TICKS` ticks. Energies, which
+    require the records, may prove that the run is stable, or contradict that it settled.
 
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.
@@ -154,8 +152,7 @@ def judge_virtual_run(
     if run.diverged_s is None:
         executed_scenario = msgspec.structs.replace(scenario, duration_s=run.ran_s)
     if end is None:
-        trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
-        end = trace.classify_end(executed_scenario)
+        end = RunEnd.of_run(run, executed_scenario)
     findings = RunFindings(
         end=end,
         roots=find_run_roots(executed_scenario, run),
@@ -174,11 +171,11 @@ def judge_virtual_run(
     )
     if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(executed_scenario):
         # Only a written log contains the memories from which laws compute declared energies.
-        if find_energy_laws(executed_scenario, own_laws=True):
+        if ObservedEnergy.find_laws(executed_scenario, own_laws=True):
             log: Log = SimulatedLog(executed_scenario)
         else:
             log = simulate_columns(executed_scenario)
-        certificate_of_log = certify_log(log, own_laws=True)
+        certificate_of_log = Certificate.of_log(log, own_laws=True)
         certificate = replace(
             certificate_of_log,
             roots=findings.roots,
@@ -194,4 +191,4 @@ def judge_virtual_run(
 def _has_energies(scenario: Scenario) -> bool:
     """Returns True if a run has the energy function V, or energies that its laws declare."""
     has_functional = not MissingFunctional.list_of_scenario(scenario)
-    return has_functional or bool(find_energy_laws(scenario, own_laws=True))
+    return has_functional or bool(ObservedEnergy.find_laws(scenario, own_laws=True))

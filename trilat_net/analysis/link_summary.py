@@ -1,20 +1,19 @@
-"""Summarises the network connections of a run: delays, losses, message counts and clocks.
+"""Summarises the network links of a run: delays, losses, message counts and clocks.
 
-A link is the one-way connection from one arm to another. In every tick (period of its control
-loop), an arm sends its state over the link, which is called a sample. The receiver uses the
-newest sample that has arrived and whose emulated delay has passed. The effective delay is the
-age of the sample in use (age of information; Kaul, Yates and Gruteser 2012).
-docs/reference/metrics.md defines each quantity.
+At every tick, a site sends one sample over the link. The receiver uses the newest sample that
+has arrived and whose emulated delay has passed. The effective delay is the age of the sample in
+use (age of information; Kaul, Yates and Gruteser 2012). docs/reference/metrics.md defines each
+quantity.
 
-The program delays samples itself, to emulate a network. Each delay depends only on the random
-seed, the link and the number of the sample. Therefore `predict_delivery` can compute the delays
-again from the scenario, even for samples that never arrived.
+The program itself delays samples to emulate a network. Each delay depends only on the random
+seed, the link and the sample number. `predict_delivery` can therefore recompute the delays from
+the scenario, even for samples that never arrived.
 
 Invariant:
     - A quantity that the log does not determine is `None`.
-    - Estimates of clocks are reported as they were used while the session ran.
-    - Every record of a tick names the samples that arrived. If a record is missing, its samples
-      count neither as arrived nor as lost.
+    - Clock estimates are reported as they were used while the session ran.
+    - The record of each tick names the samples that arrived. If a record is missing, its
+      samples are counted neither as arrived nor as lost.
 """
 
 from typing import NamedTuple
@@ -55,9 +54,9 @@ class _PredictedDelivery(NamedTuple):
 
     @property
     def lost(self) -> Bools:
-        """Marks the samples that the delay model of the link loses on purpose, shape (M,).
+        """Marks the samples that the delay model of the link drops deliberately, shape (M,).
 
-        A receiver does not expect these samples, and they do not count as missing.
+        A receiver does not expect these samples, and they are not counted as missing.
         """
         lost: Bools = self.due_ns == LOST
         return lost
@@ -67,14 +66,14 @@ class _PredictedDelivery(NamedTuple):
         """Delays that the delay model of the scenario adds to the samples, in ms.
 
         Samples that the model loses, and samples that have only the delay of the real network,
-        are left out. The effects of duplicates, reordering and the play-out buffer are not
+        are excluded. The effects of duplicates, reordering and the play-out buffer are not
         included.
         """
         delivered = ~self.lost & ~self.measured
         return (self.drawn_ns[delivered] - self.stamp_ns[delivered]) / 1e6
 
     def release(self, rate_hz: int) -> Ints:
-        """Computes the tick of the receiver in which each sample may first be used.
+        """Computes the tick of the receiver at which each sample may first be used.
 
         This is the first tick after the delay of the sample. If the sample has not arrived by
         then, the receiver uses it later.
@@ -83,7 +82,7 @@ class _PredictedDelivery(NamedTuple):
             rate_hz: Tick rate of the receiver, in Hz.
 
         Returns:
-            The tick of each of the M samples, shape (M,). `LOST` for a lost sample.
+            One tick per sample, shape (M,). `LOST` for a lost sample.
         """
         ticks = LinkSchedule.first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         return np.where(self.lost, LOST, ticks)
@@ -95,18 +94,18 @@ def predict_delivery(
     site: str,
     count: int,
 ) -> _PredictedDelivery:
-    """Computes when each message of another arm comes into use, as defined by the scenario.
+    """Computes when each sample of a peer comes into use, as defined by the scenario.
 
-    The scenario delays the messages (samples) in a repeatable way to emulate a network.
+    The scenario delays samples in a reproducible way to emulate a network.
 
     Args:
         log: The log of the run, which contains the scenario and the changes of the delays.
-        peer: Name of the site that sends.
-        site: Name of the site that receives.
+        peer: Name of the sending site.
+        site: Name of the receiving site.
         count: Number of samples to predict.
 
     Raises:
-        LogError: A recorded change is not valid.
+        LogError: A recorded change is invalid.
     """
     links = log.scenario.setup(site).links
     link_setup = next(link for link in links if link.peer == peer)
@@ -162,11 +161,10 @@ class _Arrivals(NamedTuple):
 
     @property
     def first(self) -> "_Arrivals":
-        """These arrivals without duplicates: only the first arrival of each sample is kept.
+        """The arrivals without duplicates: only the first arrival of each sample is kept.
 
-        A site uses only the first arrival of a sample. Statistics of delays must not count a
-        sample twice. The result is ordered by the number of the sample, which the sender counts
-        from 0.
+        A site uses only the first arrival of a sample, and statistics of delays must not count
+        a sample twice. The result is ordered by sample number, counted from 0 by the sender.
         """
         sample, rows = np.unique(self.sample, return_index=True)
         return _Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
@@ -283,18 +281,18 @@ ONE_WAY_SCHEMA_VERSION = 2
 
 
 class ValueStatistics(NamedTuple):
-    """Mean, standard deviation, percentiles and extremes of numbers, such as delays in ms.
+    """Mean, standard deviation, percentiles and extremes of a data set, such as delays in ms.
 
-    All attributes have the unit of the numbers.
+    All attributes have the unit of the data.
 
     Attributes:
         mean: Arithmetic mean.
         deviation: Standard deviation.
         p50: Median.
-        p95: Value that 95 % of the numbers do not exceed.
-        p99: Value that 99 % of the numbers do not exceed.
-        min: Smallest number.
-        max: Largest number.
+        p95: 95th percentile.
+        p99: 99th percentile.
+        min: Smallest value.
+        max: Largest value.
     """
 
     mean: float
@@ -307,13 +305,13 @@ class ValueStatistics(NamedTuple):
 
     @classmethod
     def of_values(cls, values: ArrayLike) -> "ValueStatistics | None":
-        """Computes mean, standard deviation, percentiles and extremes of numbers like delays.
+        """Computes mean, standard deviation, percentiles and extremes of a data set.
 
         Args:
-            values: The numbers.
+            values: The data.
 
         Returns:
-            The statistics. `None` if there are no numbers.
+            The statistics, or `None` if there are no data.
         """
         numbers = np.asarray(values, dtype=np.float64)
         if not numbers.size:
@@ -349,22 +347,24 @@ class _AgeHistogram(NamedTuple):
 
 
 class ClockSummary(NamedTuple):
-    """Difference between the clocks of the two ends of a network link.
+    """Difference between the clocks at the two ends of a network link.
 
     Measured one-way delays are only as accurate as this difference. docs/reference/metrics.md
     defines the quantities under `clock.*`.
 
     Attributes:
         offset_us: Last estimate of the sender's clock minus the receiver's, in microseconds.
-        offset_first_us: First estimate.
-        drift_ppm: Rate of the sender's clock against the receiver's, minus 1. `None` without an
+        offset_first_us: First estimate of this offset, in microseconds.
+        drift_ppm: Rate of the sender's clock relative to the receiver's, minus 1, in ppm.
+            `None` without an estimate.
+        drift_bound_ppm: Largest possible error of the drift, in ppm. `None` without an
             estimate.
-        drift_bound_ppm: Largest possible error of the drift. `None` without an estimate.
-        bound_us: Largest possible error of the last estimate of the offset.
+        bound_us: Largest possible error of the last offset estimate, in microseconds.
         bound_p50_us: Median of this error over the run.
         bound_max_us: Maximum of this error over the run.
-        rtt_min_us: Shortest round trip of a query for the clock. `None` without a reply.
-        faults: Number of detected steps of a clock.
+        rtt_min_us: Shortest round trip of a clock query, in microseconds. `None` without a
+            reply.
+        faults: Number of detected clock steps.
     """
 
     offset_us: int
@@ -379,25 +379,25 @@ class ClockSummary(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """True if sender and receiver run on one machine and thus read the same clock.
+        """True if sender and receiver run on the same machine and thus read the same clock.
 
-        The text of a link then leaves out its clock, because no offset had to be estimated.
+        Reports on a link then omit its clock, because no offset had to be estimated.
         """
         return self.bound_max_us == 0 and self.offset_us == 0
 
     @classmethod
     def of_link(cls, log: Log, peer: str, site: str) -> "ClockSummary | None":
-        """Returns how far the clocks of two arms differ, as one of them estimated in a session.
+        """Returns the clock difference between two sites, as estimated by one of them.
 
-        The age of a message is known only as accurately as this difference.
+        The age of a sample is only known as accurately as this difference.
 
         Args:
             log: The log of the run.
             peer: Name of the peer.
-            site: Name of the site that estimated the clock.
+            site: Name of the site that estimated the difference.
 
         Returns:
-            The estimates. `None` in virtual time, or if the site published no estimates.
+            The estimates, or `None` in virtual time or if the site published no estimates.
         """
         stats = [report for report in log.link_stats(site) if peer in report.offset_us]
         if not stats:
@@ -427,9 +427,8 @@ class ClockSummary(NamedTuple):
 
 
 class SampleCounts(NamedTuple):
-    """Counts of sent, used, lost and late messages of a network link, from the receiver's log.
+    """Counts of sent, used, lost and late samples of a network link, from the receiver's log.
 
-    Such a message, called a sample, contains the state of an arm in one control period.
     docs/reference/metrics.md defines these counts under `samples.*`.
 
     Attributes:
@@ -439,11 +438,11 @@ class SampleCounts(NamedTuple):
         missing: Judged samples that did not arrive.
         lost: Samples that arrived, but were lost by the emulated network and therefore not
             used.
-        late: Samples that arrived after the tick in which they should have come into use.
-        superseded: Samples that came too late to be used, because a newer sample was in use.
-        duplicate: Further arrivals of samples that had arrived before.
-        copies: Duplicates that the emulated network makes.
-        refused: Arrivals that the receiver rejected, because their time stamp is out of range.
+        late: Samples that arrived after the tick at which they should have come into use.
+        superseded: Samples that arrived too late to be used, because a newer sample was in use.
+        duplicate: Repeated arrivals of samples that had arrived before.
+        copies: Duplicates generated by the emulated network.
+        refused: Arrivals that the receiver rejected because their time stamp is out of range.
     """
 
     sent: int
@@ -461,25 +460,24 @@ class SampleCounts(NamedTuple):
 class LinkSummary(NamedTuple):
     """Summary of a network link in a run: its delay, its losses and its counts.
 
-    A link is the directed connection from a peer to a site. docs/reference/metrics.md
-    ("Links") defines the quantities. A quantity that the log does not determine is `None`. The
-    age of a sample is the time since the peer sent it. A sample is judged if the log shows
-    whether it arrived.
+    docs/reference/metrics.md ("Links") defines the quantities. A quantity that the log does not
+    determine is `None`. The age of a sample is the time since the peer sent it. A sample is
+    judged if the log shows whether it arrived.
 
     Attributes:
         peer: Name of the sender.
         site: Name of the receiver.
         stated: Delay models that the scenario and its changes prescribe for the link.
-        drawn_ms: Statistics of the delays that these models gave to the samples, in ms.
+        drawn_ms: Statistics of the delays that these models added to the samples, in ms.
         age_ms: Statistics of the effective delay, which is the age of the sample in use at each
             tick, in ms.
         ages: Histogram of the effective delay.
-        first_use_s: Time at which the first sample came into use, in s.
-        ticks_without_new: Fraction of the ticks in which no new sample came into use.
+        first_use_s: When the first sample came into use, in s.
+        ticks_without_new: Fraction of the ticks at which no new sample came into use.
         silence_ms: Longest time between two new samples in use, in ms.
         counts: Counts of samples.
         loss: Fraction of the judged samples that could not come into use.
-        burst: Mean number of successive samples that were lost together.
+        burst: Mean number of consecutive samples that were lost together.
         one_way_us: Statistics of the measured one-way delays, in microseconds.
     """
 
@@ -499,12 +497,12 @@ class LinkSummary(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the link as in scenarios: "m1->s" for messages from arm m1 to arm s."""
+        """Name of the link as in scenarios: "m1->s" for samples from arm m1 to arm s."""
         return f"{self.peer}->{self.site}"
 
     @property
     def plain(self) -> bool:
-        """True if the link only delayed every sample by one constant time.
+        """True if the link did nothing but delay every sample by the same constant time.
 
         No sample of such a link was late, missing or lost, and a single line of text describes
         it completely.
@@ -515,15 +513,15 @@ class LinkSummary(NamedTuple):
 
     @classmethod
     def list_of_log(cls, log: Log) -> "list[LinkSummary]":
-        """Returns delays, losses and message counts of every network link of a run.
+        """Returns delays, losses and sample counts of every network link of a run.
 
-        The summaries have the order of the receivers, and then of the senders, in the scenario.
+        The summaries are sorted by receiver and then by sender, both in scenario order.
 
         Args:
             log: The log of the run.
 
         Raises:
-            LogError: A record names a change that is not valid.
+            LogError: A record names an invalid change.
         """
         stated_links = Timeline(log).stated_links
         arrivals_by_site = {site: _read_arrivals(log, site) for site in log.sites}
@@ -553,13 +551,13 @@ class LinkSummary(NamedTuple):
 def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
     """Counts ages in a histogram of at most `MOST_AGE_BINS` bins.
 
-    The width of a bin is 1, 2 or 5 times a power of ten, and at least 10 microseconds.
+    The bin width is 1, 2 or 5 times a power of ten, and at least 10 microseconds.
 
     Args:
         age_ns: Ages, shape (K,), in ns.
 
     Returns:
-        The histogram. `None` without ages.
+        The histogram, or `None` if there are no ages.
     """
     if not len(age_ns):
         return None
@@ -704,17 +702,17 @@ def _count_samples(
 
 
 class DelayDistribution(NamedTuple):
-    """Delays and ages of all messages (samples) on one network link, for a histogram.
+    """Delays and ages of all samples on one network link, for a histogram.
 
-    The delay of a sample is the time from sending to its first use. The age is measured at each
-    tick at which a sample is in use: it is the time since the sample was sent.
+    The delay of a sample is the time from sending to first use. Ages are measured at each tick
+    at which a sample is in use: the age is the time since the sample was sent.
 
     Attributes:
         peer: Name of the sender.
         site: Name of the receiver.
-        delay_ms: Delays of the samples, shape (S,). They follow from the link's model if the
-            scenario has one, and were measured otherwise.
-        age_ms: Age of the sample in use at each tick of the receiver, shape (K,).
+        delay_ms: Delays of the samples, shape (S,), in ms. They are computed from the link's
+            model if the scenario has one, and measured otherwise.
+        age_ms: Age of the sample in use at each tick of the receiver, shape (K,), in ms.
     """
 
     peer: str
@@ -724,15 +722,13 @@ class DelayDistribution(NamedTuple):
 
     @classmethod
     def list_of_log(cls, log: Log) -> "list[DelayDistribution]":
-        """Collects the delays of all messages on every network link of a run, for histograms.
-
-        The ages at which control loops used the messages are added.
+        """Collects the delays and ages of all samples on every link of a run, for histograms.
 
         Args:
             log: Log of the run.
 
         Returns:
-            An entry per link, ordered by receiver and then by sender.
+            One entry per link, sorted by receiver and then by sender.
         """
         distributions = []
         for site in log.sites:

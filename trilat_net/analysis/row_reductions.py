@@ -2,10 +2,10 @@
 
 The records of a run are arrays with tens of thousands of rows and one column per joint. NumPy
 reduces each row of such an array in a separate loop, which takes about ten times as long as
-combining whole columns.
+combining entire columns.
 
 Invariant:
-    - The results have the same bits as those of NumPy's reductions along the last axis.
+    - The results are bitwise equal to those of NumPy's reductions along the last axis.
 """
 
 import numpy as np
@@ -20,10 +20,10 @@ pairs.
 
 
 def sum_rows(values: Array) -> Array:
-    """Returns the sum of each row of a table of numbers, shape (K,).
+    """Returns the sum of each row of an array, shape (K,).
 
     Args:
-        values: Numbers, shape (K, n).
+        values: The array, shape (K, n).
     """
     columns = values.shape[1]
     if not 1 <= columns <= _SEQUENTIAL_COLUMNS:
@@ -36,10 +36,10 @@ def sum_rows(values: Array) -> Array:
 
 
 def max_rows(values: Array) -> Array:
-    """Returns the largest number in each row of a table, shape (K,). NaN makes the result NaN.
+    """Returns the maximum of each row of an array, shape (K,). NaN makes the result NaN.
 
     Args:
-        values: Numbers, shape (K, n), with at least one column.
+        values: The array, shape (K, n), with at least one column.
     """
     largest = values[:, 0].copy()
     for column in range(1, values.shape[1]):
@@ -48,10 +48,10 @@ def max_rows(values: Array) -> Array:
 
 
 def any_in_rows(values: NDArray[np.generic]) -> NDArray[np.bool_]:
-    """Returns True for each row of a table that contains any value that is true or not zero.
+    """Returns True for each row of an array that contains any entry that is true or nonzero.
 
     Args:
-        values: Numbers or truth values, shape (K, n).
+        values: Numeric or boolean array, shape (K, n).
     """
     is_any = np.zeros(len(values), dtype=np.bool_)
     for column in range(values.shape[1]):

@@ -1,23 +1,23 @@
-"""Judges by the motion at the end of a run whether it is stable, not stable, or open.
+"""Judges from the motion at the end of a run whether it is stable, not stable, or open.
 
-A site is the process that runs one arm. The judgement rests on the error e of each site (the
-difference between its motion and the motion that it follows) and on the joint velocities qd,
-and not on any theory. The largest |e| and |qd| of each joint in intervals of 50 ms are called
-envelopes. Their trends over the second half of the run, which `envelope_trend` determines,
-decide whether the joint converges, decays, oscillates, drifts or grows. If the record does not
-decide this, the joint is undecided, and the judgement is open.
+The verdict is based on the error e of each site (the difference between its motion and its
+reference) and on the joint velocities qd, not on any theory. The largest |e| and |qd| of each
+joint in intervals of 50 ms are called envelopes. Their trends over the second half of the run,
+which `envelope_trend` determines, decide whether the joint converges, decays, oscillates,
+drifts or grows. If the record does not show which, the joint is undecided, and the verdict is
+open.
 
 If an operator acts or the control loop changes within the second half, only the time after the
 last action or change is judged, provided that it is long enough.
 
-A lasting oscillation makes a run not stable. There is an exception: a joint may oscillate
-steadily for a while, because it receives energy from a faster joint. If the faster joint
-decays, the joint is undecided.
+A lasting oscillation makes a run not stable, with one exception: a joint may oscillate steadily
+for a while because it receives energy from a faster joint. If the faster joint decays, the
+joint is undecided.
 
 Invariant:
-    - All commands use the judgement of this module (docs/reference/stability.md).
+    - All commands use the verdict of this module (docs/reference/stability.md).
     - Each joint of each site is judged separately, and the worst joint decides.
-    - A judgement describes the record and predicts nothing.
+    - A verdict describes the record and predicts nothing.
     - Further knowledge, such as the energy function V of the stability proof or the
       characteristic roots, may turn a stable run into an open run, but never the reverse.
 """
@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import BUCKETS_PER_S, LIVE_KINDS, OWN_KINDS, Array, DominanceMatrix, TorqueKind
+from ..execution import FusedRun
 from ..hooks import find_hook
 from ..log import Ints, Log, SiteLog
 from ..scenario import Scenario
@@ -38,7 +39,7 @@ from .arm_rows import HANGING_RAD, build_arm_rows
 from .site_signals import SETTLED_ERROR_RAD, JointError
 from .timeline import Timeline
 from .torque_sources import SourceRows
-from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
+from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend
 
 SETTLED_SPEED_RAD_S = 1e-2
 """Largest speed in the last second at which the arms of a run count as resting, in rad/s."""
@@ -88,10 +89,10 @@ MIN_SIGN_CHANGES = 6
 
 
 class Stability(StrEnum):
-    """The four judgements of a run. The value of each member is the word that users read.
+    """The four verdicts on a run. The value of each member is the word that users read.
 
-    STABLE needs a proof that the run does not contradict. SETTLED means that the motion became
-    slow or decays, without a proof. OPEN means that the findings do not decide.
+    STABLE requires a proof that the run does not contradict. SETTLED means that the motion
+    became slow or decays, without a proof. OPEN means that the findings do not decide.
     """
 
     STABLE = "stable"
@@ -103,8 +104,8 @@ class Stability(StrEnum):
 class EndBehaviour(StrEnum):
     """How the arms move at the end of a run, from the best to the worst behaviour.
 
-    The order matters, because the worst joint decides the judgement of the run. `stability`
-    translates the behaviour to a judgement. The value of each member is a phrase for the user.
+    The order matters, because the worst joint decides the verdict on the run. `stability` maps
+    the behaviour to a verdict. The value of each member is a phrase for the user.
     """
 
     CONVERGED = "converged"
@@ -119,11 +120,11 @@ class EndBehaviour(StrEnum):
 
     @property
     def stability(self) -> Stability:
-        """The judgement that the motion at the end alone suggests.
+        """The verdict suggested by the final motion alone.
 
         Arms at rest or with decaying motion give SETTLED, motion without a clear trend gives
-        OPEN, and oscillating, drifting or growing motion gives NOT_STABLE. In
-        `stability_decision` other knowledge, such as proofs, may change the judgement.
+        OPEN, and oscillating, drifting or growing motion gives NOT_STABLE. `stability_decision`
+        may change the verdict because of other evidence, such as proofs.
         """
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.SETTLED
@@ -137,7 +138,7 @@ _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class EndDoubt(NamedTuple):
-    """Finding that leaves open whether a run is stable although its motion dies away.
+    """Finding that leaves open whether a run is stable although its motion decays.
 
     Attributes:
         name: Name of the finding. "sites apart": coupled sites do not agree, although nothing
@@ -145,10 +146,10 @@ class EndDoubt(NamedTuple):
             "arm thrown": an arm ends far away from every start pose, although no operator
             pushed. "loop changes": the control loop changes within the judged part. "operator
             acts": an operator changes its action within the judged part.
-        sites: Names of the sites concerned. For "sites apart", the sites with the smallest and
+        sites: Names of the affected sites. For "sites apart", the sites with the smallest and
             the largest angle.
         distance_rad: Distance between the sites that are apart, or distance of the thrown arm
-            from the start poses.
+            from the start poses, in rad.
         until_s: Time of the last change or action, in s.
     """
 
@@ -159,7 +160,7 @@ class EndDoubt(NamedTuple):
 
 
 class RunEnd(NamedTuple):
-    """How the motion of a run ends, such as at rest or growing, with the numbers that show it.
+    """How the motion of a run ends, such as at rest or growing, with the data that show it.
 
     The trends of the tracking error e and of the joint velocity qd over the last part of the
     run decide. The object describes all arms of the run, or a single joint while the joints are
@@ -169,8 +170,8 @@ class RunEnd(NamedTuple):
         behaviour: Behaviour of the worst joint, such as settled or growing.
         error: Trend of that joint's |e|.
         speed: Trend of that joint's |qd|.
-        end_error_rad: Largest |e| of all joints in the last second.
-        end_speed_rad_s: Largest |qd| of all joints in the last second.
+        end_error_rad: Largest |e| of all joints in the last second, in the unit `error_unit`.
+        end_speed_rad_s: Largest |qd| of all joints in the last second, in rad/s.
         end_error_where: Name of the joint, or of the axis of the end effector, with this |e|.
             Empty if the joint is not known.
         end_speed_where: Name of the joint with this |qd|. Empty if the joint is not known.
@@ -179,15 +180,14 @@ class RunEnd(NamedTuple):
             decided.
         operator_acts: True if an operator changes its action in the judged part, instead of
             only holding an arm.
-        diverged_at_s: Time at which the first site exceeded its limits, in s. `None` if no site
-            did.
+        diverged_at_s: When the first site exceeded its limits, in s, or `None` if no site did.
         divergence: Phrase that names the joint that exceeded its limit, and the time. Empty if
             no log contains this information.
-        frequency_hz: Frequency of a bounded oscillation. `None` if there is none.
+        frequency_hz: Frequency of a bounded oscillation, in Hz, or `None` if there is none.
         missing_sites: Sites without any record, which leave the run undecided.
         error_unit: Unit of |e|: "rad", or "m" if the sites follow positions in task space.
-        counts_from_s: Time after which the run is considered, in s. The second half of the time
-            after it is the judged part.
+        counts_from_s: Only the run after this time is considered, in s. The judged part is the
+            second half of the time after it.
         quiet_from_s: Time from which no operator acts and the control loop does not change, in
             s.
         lasts_s: Length of the record, in s.
@@ -214,7 +214,7 @@ class RunEnd(NamedTuple):
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run by its end: stable, not stable, or open.
+        """The verdict on the run from its end: stable, not stable, or open.
 
         A run that looks stable is open if there are `doubts`. A run that does not look stable
         is open if an operator acts, because the operator may have caused the motion. If the
@@ -230,27 +230,27 @@ class RunEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for the user on how the motion ends, with the numbers that show it.
+        """A sentence for the user on how the motion ends, with the values that show it.
 
-        The sentence also contains the reasons why the run cannot be called stable. The package
-        `presentation` writes it.
+        The sentence also states the reasons why the run cannot be called stable. The package
+        `presentation` generates it.
         """
         return str(find_hook("describe a finding")(self))
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences that say why the stability of the run remains open, one for each doubt.
+        """Sentences on why the stability of the run remains open, one per doubt.
 
-        Empty if the stability is decided. The package `presentation` writes the sentences.
+        Empty if the stability is decided. The package `presentation` generates the sentences.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 
     @classmethod
     def of_log(cls, log: Log) -> "RunEnd":
-        """Judges from a log whether the motion of the arms died away at the end of the run.
+        """Judges from a log whether the motion of the arms decayed at the end of the run.
 
-        A log that is torn or empty leaves the end undecided. If the run ends in a bounded
-        oscillation, its frequency is computed too.
+        If the log is truncated or empty, the end is undecided. If the run ends in a bounded
+        oscillation, its frequency is also computed.
 
         Args:
             log: The log of the run.
@@ -266,6 +266,43 @@ class RunEnd(NamedTuple):
         site_logs = [log[site] for site in log.sites]
         return end._replace(frequency_hz=_find_frequency_hz(site_logs))
 
+    @classmethod
+    def of_run(cls, run: FusedRun, scenario: Scenario) -> "RunEnd":
+        """Judges whether the motion of the arms decayed at the end of a simulated run.
+
+        The result is the same as that of `of_log` for a log of the run, but without the
+        quantities that require records.
+
+        Args:
+            run: The run in the fused loop.
+            scenario: Scenario of the run, whose duration may differ from that of the run.
+        """
+        return RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+
+    @staticmethod
+    def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
+        """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
+
+        An arm that its controller does not hold also comes to rest, but must not be considered
+        stable.
+
+        Args:
+            scenario: The scenario, with the start poses.
+            ends: Final joint angles of the sites to be judged, keyed by site name, shape (n,)
+                each, in rad.
+
+        Returns:
+            Names of these sites. Empty if no arm fell.
+        """
+        hanging = []
+        for site, q in ends.items():
+            arm = build_arm_rows(scenario, site)
+            start = np.array(scenario.sites[site].q0_rad)
+            hangs = arm.hanging_angle(q) < HANGING_RAD
+            if hangs and arm.hanging_angle(start) >= HANGING_RAD:
+                hanging.append(site)
+        return hanging
+
 
 class RunTrace(NamedTuple):
     """The reduced data from which the end of a run is judged, per site in scenario order.
@@ -275,17 +312,16 @@ class RunTrace(NamedTuple):
 
     Attributes:
         buckets: For each site, an array with one row per interval, shape (K, 3 n). A row
-            contains the largest |e|, the largest |qd|, and the last angle q of every joint. It
-            contains -1 in an interval without a record. There may be columns for more joints
-            than the site has. The last interval may be incomplete, and no trend uses it.
+            contains the largest |e|, the largest |qd|, and the last angle q of every joint, or
+            -1 in an interval without a record. There may be columns for more joints than the
+            site has. The last interval may be incomplete, and no trend uses it.
         tau_x: For each site, the torque of operator and environment at the last record, shape
             (n,), in N m.
-        diverged_at_s: Time at which the first site exceeded its limits, in s. `None` if no site
+        diverged_at_s: When the first site exceeded its limits, in s, or `None` if no site did.
+        pushed_until_s: When an operator whose action is not part of the scenario last pushed an
+            arm, in s, or 0 if no such operator pushed.
+        changed_until_s: When a command last changed the control loop, in s, or 0 if no command
             did.
-        pushed_until_s: Last time, in s, at which an operator whose action is not part of the
-            scenario pushed an arm. 0 if no such operator pushed.
-        changed_until_s: Last time at which a command changed the control loop, in s. 0 if no
-            command did.
     """
 
     buckets: Sequence[Array]
@@ -296,7 +332,7 @@ class RunTrace(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log) -> "RunTrace":
-        """Reduces a log to the data that are needed to judge the end of its run.
+        """Reduces a log to the data needed to judge the end of its run.
 
         The reduced data of a long log fit into memory. Simulations without a log produce data
         of the same kind.
@@ -305,7 +341,7 @@ class RunTrace(NamedTuple):
             log: The log of the run.
 
         Returns:
-            For each joint and each interval of 50 ms: the largest magnitude of its error and of
+            For each joint and each interval of 50 ms, the largest magnitude of its error and of
             its velocity, and its last angle. Also the external torques at the end, and the
             times of the last push and the last change.
         """
@@ -345,19 +381,19 @@ class RunTrace(NamedTuple):
         """Adds further records of a site to the data from which the end of its run is judged.
 
         The records of an interval (bucket) are reduced to the largest |e|, the largest |qd| and
-        the last q of each joint, see `RunTrace`. In task space e has as many columns as the
-        task has coordinates. Columns that e, qd or q lack are filled with zeros.
+        the last q of each joint (see `RunTrace`). In task space, e has as many columns as the
+        task has coordinates. Missing columns of e, qd or q are filled with zeros.
 
         Args:
-            bucket: Index of the interval of each record, ascending, shape (K,).
+            bucket: Interval index of each record, in ascending order, shape (K,).
             e: Synchronisation errors, shape (K, n).
             qd: Joint velocities, shape (K, n), in rad/s.
             q: Joint angles, shape (K, n), in rad.
-            into: Data of all earlier records. They may be changed in place, and may have spare
+            into: Data of all earlier records, which may be modified in place and may have spare
                 rows.
 
         Returns:
-            The data with the new records.
+            The data including the new records.
         """
         if not len(bucket):
             return into
@@ -387,14 +423,14 @@ class RunTrace(NamedTuple):
         return into
 
     def classify_end(self, scenario: Scenario) -> RunEnd:
-        """Judges from reduced data whether the motion died away at the end of a run.
+        """Judges from reduced data whether the motion decayed at the end of a run.
 
         The worst joint of all sites decides. A run whose joints have stable trends is left open
         if its sites do not agree, if arms fell, or if the control loop changed until shortly
         before the end.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
         """
         sites = _split_buckets(scenario, self)
         # the last interval may be incomplete
@@ -538,7 +574,7 @@ def _find_worst_joint(
     envelopes = []
     for site in columns:
         envelopes += [site[:, 0], site[:, 1]]
-    fits = iter(fit_envelopes(t_s, np.hstack(envelopes)))
+    fits = iter(EnvelopeFit.fit_columns(t_s, np.hstack(envelopes)))
 
     ends = []
     for name, judged, whole in zip(scenario.names, columns, sites, strict=True):
@@ -822,16 +858,16 @@ def _count_sign_changes(values: Array) -> int:
 
 
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
-    """Groups the sites that follow each other at any time, directly or through further sites.
+    """Groups the sites that follow each other at any time, directly or through other sites.
 
-    Only sites of the same group are expected to agree at the end of a run. For example, m1 and
-    s are in one group with m2 if s follows both masters.
+    Only sites of the same group are expected to agree at the end of a run. For example, m1, m2
+    and s form one group if s follows both masters.
 
     Args:
         scenario: Scenario of the run, with the changes of its dominance factors.
 
     Returns:
-        Indices of the sites of each group.
+        For each group, the indices of its sites.
     """
     total_shares = scenario.alpha.copy()
     for change in scenario.timeline:
@@ -884,7 +920,7 @@ def _find_disagreement(
         joint = int(spread[-1].argmax())
         end_spread = spread[-1, joint]
         envelope = spread.max(axis=1, keepdims=True)
-        (distance_fit,) = fit_envelopes(t_s, envelope)
+        (distance_fit,) = EnvelopeFit.fit_columns(t_s, envelope)
         is_approaching = distance_fit.trend is EnvelopeTrend.DECAYS
 
         # A torque at the end holds the sites apart if the errors are large enough, or if the
@@ -954,7 +990,7 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDo
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     end_by_site = dict(zip(scenario.names, ends, strict=True))
-    hanging = find_hanging_sites(scenario, end_by_site)
+    hanging = RunEnd.find_hanging_sites(scenario, end_by_site)
     if hanging:
         yield EndDoubt("arms fell", tuple(hanging))
         return
@@ -971,29 +1007,6 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[EndDo
     if distances[worst] > THROWN_RAD and not (scenario.external or has_operator):
         thrown = scenario.names[worst]
         yield EndDoubt("arm thrown", (thrown,), distance_rad=distances[worst])
-
-
-def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Finds the sites whose arms fell: they hang down at the end, but did not at the start.
-
-    An arm whose controller does not hold it comes to rest as well, but must not count as
-    stable.
-
-    Args:
-        scenario: The description of the experiment, with the start poses.
-        ends: Last joint angles of the sites to be judged, by name, shape (n,) each, in rad.
-
-    Returns:
-        Names of these sites. Empty if no arm fell.
-    """
-    hanging = []
-    for site, q in ends.items():
-        arm = build_arm_rows(scenario, site)
-        start = np.array(scenario.sites[site].q0_rad)
-        hangs = arm.hanging_angle(q) < HANGING_RAD
-        if hangs and arm.hanging_angle(start) >= HANGING_RAD:
-            hanging.append(site)
-    return hanging
 
 
 def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:

@@ -1,19 +1,19 @@
-"""Finds circumstances of a run that a reader of its stability judgement should know.
+"""Finds circumstances of a run that a reader of its stability verdict should know about.
 
 For example, a run may be stable although a motor was at its torque limit for 2 s. Such a
-circumstance does not change the judgement, but shows that the arms or the computers were at
-their limits. The circumstances are:
+circumstance does not change the verdict, but shows that the arms or the computers were at their
+limits. The circumstances are:
 
 - a motor was at its torque limit and did not apply the full torque of the control law;
-- an operator or a wall pushed with a large share of the torque limit;
-- ticks (periods of the control loop) began a whole period or more too late;
+- an operator or a wall pushed with a large fraction of the torque limit;
+- ticks began late by a full period or more;
 - samples in use were clearly younger or older than the delay that the scenario states for their
   link;
-- a program of the user moved an arm, or failed while moving an arm.
+- a user's program moved an arm, or failed while moving an arm.
 
 Invariant:
-    - Each arm that is named has a number that shows the circumstance.
-    - The package `presentation` writes a remark for each circumstance that occurred.
+    - Each named arm comes with a number that shows the circumstance.
+    - The package `presentation` generates one remark for each circumstance that occurred.
 """
 
 from collections.abc import Mapping
@@ -74,18 +74,19 @@ class _OddAge(NamedTuple):
 class RunCircumstances(NamedTuple):
     """Circumstances of a run that may explain why it was judged stable or not.
 
-    `RunCircumstances.of_log` finds them. An object that is created without arguments means that
-    none occurred.
+    `RunCircumstances.of_log` finds them. An object created without arguments means that none
+    occurred.
 
     Attributes:
-        at_limit_s: How long the motors of each site were at their torque limit, in s, by site.
-        large_pushes: The largest push at each site where it was a large share of the limit.
-        late_ticks: Number of ticks that began late by a period or more, by site.
-        odd_age: Age of the samples in use on the link where it differs most from the stated
-            delay. `None` if every link agrees.
-        program_sites: Sites whose arms a program of the user moved. The judgement ignores how
+        at_limit_s: How long the motors of each site were at their torque limit, in s, keyed by
+            site.
+        large_pushes: The largest push at each site where it was a large fraction of the limit.
+        late_ticks: Number of ticks that began late by a period or more, keyed by site.
+        odd_age: Age of the samples in use on the link where it deviates most from the stated
+            delay, or `None` if every link agrees.
+        program_sites: Sites whose arms were moved by a user's program. The verdict ignores how
             the program reacts to the arms.
-        failures: Sentences of the log on programs that failed.
+        failures: Sentences from the log about programs that failed.
     """
 
     at_limit_s: Mapping[str, float] = MappingProxyType({})
@@ -97,10 +98,10 @@ class RunCircumstances(NamedTuple):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences for the user without a full stop, one for each circumstance that occurred.
+        """Sentences for the user, one per circumstance that occurred, without a full stop.
 
-        For example "m1 and m2 were at their torque limit for 0.56 s and 0.43 s". The package
-        `presentation` writes them.
+        An example is "m1 and m2 were at their torque limit for 0.56 s and 0.43 s". The package
+        `presentation` generates them.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 

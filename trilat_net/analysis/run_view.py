@@ -1,13 +1,12 @@
 """Provides the data of a recorded run from which all metrics are computed.
 
-A metric is a number that describes a run, such as the largest torque. Many metrics need the
-same data, for example the torques of operators on an arm, whose computation takes time.
-`RunView` computes shared data when a metric first needs them, and keeps them for the other
-metrics. `SiteRun` has the data of one arm: its records and the torques on it. `RunView` adds
-the weights with which the arms follow each other, the network links and the virtual walls.
+Many metrics need the same data, for example the torques of operators on an arm, which take time
+to compute. `RunView` computes shared data when a metric first needs them and caches them for
+the other metrics. `SiteRun` contains the data of one arm: its records and the torques on it.
+`RunView` adds the dominance factors, the network links and the virtual walls.
 
 Invariant:
-    - Each quantity is computed from the log only once, by `RunView.compute_once` or by a cached
+    - Each quantity is computed from the log only once, by `RunView.compute_once` or a cached
       property.
 """
 
@@ -31,15 +30,12 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """Motion and torques of one arm in a recorded run, and how the arm follows other arms.
-
-    A site is the process that controls the arm.
+    """Motion of one arm in a recorded run, the torques on it, and how it follows other arms.
 
     Attributes:
-        records: Records of the site, with one row for every tick.
+        records: Records of the site, with one row per tick.
         torque: External torque on the site's arm, divided into operator and environment.
-        dominance: Dominance factors, the weights with which the site follows its peers, over
-            time.
+        dominance: Dominance factors of the site over time.
     """
 
     records: AlignedRecords
@@ -48,7 +44,7 @@ class SiteRun(NamedTuple):
 
 
 class RunView:
-    """A recorded run, with quantities that several metrics share and that are computed once.
+    """A recorded run, with cached quantities that several metrics share.
 
     Every metric receives this object and reads arms, network links and walls from it.
 
@@ -57,7 +53,7 @@ class RunView:
 
     Attributes:
         log: The log of the run.
-        scenario: The description of the experiment.
+        scenario: The scenario of the run.
     """
 
     def __init__(self, log: Log) -> None:
@@ -66,9 +62,9 @@ class RunView:
         self._results: dict[Callable[[RunView], Any], Any] = {}
 
     def compute_once(self, compute: Callable[["RunView"], T]) -> T:
-        """Returns the result of a function of this run, which is called only the first time.
+        """Applies a function to this run, and caches the result.
 
-        Later calls with the same function return the stored result, so that several metrics
+        Later calls with the same function return the cached result, which lets several metrics
         share intermediate results.
 
         Args:
@@ -80,9 +76,9 @@ class RunView:
 
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
-        """Motion and torques of every arm with records, by the name of its site (process).
+        """Motion and torques of every arm with records, keyed by site name.
 
-        Metrics of arms without records have a reason in place of a value.
+        For arms without records, metrics contain a reason in place of a value.
         """
         runs = {}
         for site, records in AlignedRecords.by_site(self.log).items():
@@ -95,11 +91,11 @@ class RunView:
 
     @cached_property
     def shared(self) -> dict[str, SiteRun]:
-        """Motion and torques of each site in the coordinates that sites exchange, by name.
+        """Motion and torques of each site in the coordinates that sites exchange, by site name.
 
-        A site is the process that runs one arm. Sites exchange either joint angles, or poses of
-        their end effectors. In the second case the result contains poses in place of angles,
-        and forces in place of torques. Sites without records are missing.
+        Sites exchange either joint angles or poses of their end effectors. In the latter case
+        the result contains poses in place of angles, and forces in place of torques. Sites
+        without records are missing.
         """
         shared = {}
         for site, run in self.sites.items():
@@ -108,22 +104,23 @@ class RunView:
 
     @cached_property
     def absent(self) -> list[str]:
-        """Names of the arms without any record, which a log of a failed session may have."""
+        """Names of the arms without any record, as can occur in the log of a failed session."""
         return [site for site in self.log.sites if site not in self.sites]
 
     @cached_property
     def links(self) -> dict[str, LinkSummary]:
-        """Summaries of network links (delays, losses, clocks) by name, computed at first use.
+        """Summaries of network links (delays, losses, clocks), keyed by link name.
 
-        The name "m1->s" denotes the link from arm m1 to arm s.
+        The name "m1->s" denotes the link from arm m1 to arm s. The summaries are computed when
+        first used.
         """
         return {link.name: link for link in LinkSummary.list_of_log(self.log)}
 
     @cached_property
     def walls(self) -> dict[str, tuple[str, VirtualWall]]:
-        """All virtual walls by name, each with the arm that can touch it.
+        """All virtual walls, keyed by name, each with the arm that can touch it.
 
-        The name "s/1" denotes the first wall of arm s. Walls of an arm are counted from 1.
+        The name "s/1" denotes the first wall of arm s. The walls of an arm are numbered from 1.
         """
         walls = {}
         for site in self.log.sites:
@@ -136,7 +133,8 @@ class RunView:
         """Lists the names of all arms, network links or walls for which a metric is computed.
 
         Args:
-            kind: "site", "link", "wall", or "run". For "run" the list has a single empty name.
+            kind: "site", "link", "wall", or "run". For "run", the list contains a single empty
+                name.
         """
         if kind == "run":
             return [""]

@@ -1,10 +1,11 @@
-"""Finds the users who control a slave arm together, and the arms that a program moved.
+"""Finds the users who control a slave arm together, and the arms moved by a program.
 
-Each user moves the arm of a master, and the slave follows the masters with weights, the
+Each user moves the arm of a master, and the slave follows the masters according to its
 dominance factors. In some experiments a program moves the arm of one user.
 
 Invariant:
-    - A program is a hand of kind "own", or a policy whose hold the events of the log report.
+    - A program is a hand of kind "own", or a policy whose takeover of an arm is reported by the
+      events of the log.
 """
 
 from typing import NamedTuple
@@ -20,14 +21,14 @@ from ..scenario import POLICY
 class UserShares(NamedTuple):
     """How much of a slave's motion each of its users determines, at K times.
 
-    The slave follows the master of each user with a weight, the dominance factor. For example,
-    shares of 0.7 and 0.3 mean that the first user leads. In some experiments a program moves
-    the arm of one user. Whenever another user leads, a person intervenes.
+    The slave follows the master of each user with a dominance factor. For example, with shares
+    of 0.7 and 0.3 the first user leads. In some experiments a program moves the arm of one
+    user. Whenever another user leads, a person intervenes.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
-        leader: Index of the user with the largest factor, shape (K,). If no factor is larger
-            than the others, it is the index of the program's user.
+        leader: Index of the user with the largest factor, shape (K,). If no single factor is
+            largest, this is the index of the program's user.
         program: Index of the user whose arm the program moves.
     """
 
@@ -44,7 +45,7 @@ class SharedSlave:
 
     Attributes:
         name: Name of the first slave. Empty if there is none.
-        users: Names of all masters, each of which stands for its user.
+        users: Names of all masters, each of which represents its user.
     """
 
     def __init__(self, log: Log) -> None:
@@ -56,10 +57,10 @@ class SharedSlave:
 
     @property
     def program(self) -> str:
-        """The user whose arm a program moved. Empty if no program moved an arm.
+        """The user whose arm was moved by a program. Empty if no program moved an arm.
 
-        This is the last user with a hand of kind "own", or otherwise the last user whose arm a
-        policy moved, through the LeRobot plugin or in an environment.
+        This is the last user with a hand of kind "own", or otherwise the last user whose arm
+        was moved by a policy, through the LeRobot plugin or in an environment.
         """
         log = self._log
         held_by_policy = [user for user in self.users if _is_held_by_policy(log, user)]
@@ -71,15 +72,14 @@ class SharedSlave:
         return candidates[-1]
 
     def find_shares(self, alpha: Array, program: str = "") -> UserShares:
-        """Returns the weights with which the slave follows the arm of each user over time.
+        """Returns the dominance factors with which the slave follows each user over time.
 
         Args:
-            alpha: Dominance factors of the slave, the weights with which it follows its P
-                peers, at K times, shape (K, P).
+            alpha: Dominance factors of the slave for its P peers, at K times, shape (K, P).
             program: Name of the user whose arm a program moves. Empty for the last user.
 
         Returns:
-            The weights, and the user with the largest weight at each time.
+            The factors, and the user with the largest factor at each time.
 
         Raises:
             UsageError: There is no user with this name.
@@ -105,7 +105,7 @@ class SharedSlave:
 
 
 def list_program_sites(log: Log) -> list[str]:
-    """Lists the sites whose arms a program moved in a run, in scenario order.
+    """Lists the sites whose arms were moved by a program in a run, in scenario order.
 
     The program is a hand of kind "own", or a policy that moved the arm through the LeRobot
     plugin or in an environment. Unlike a script, the program reacts to the motion of the arms.

@@ -1,11 +1,10 @@
 """Computes signals of an arm from its records, such as tracking errors, and its settling time.
 
-A signal is an array with one row for each record of the log, that is for each period of the
-control loop. The settling time is the time after which an error stays small. Signals that only
-figures show are in `presentation.plot_signals`.
+A signal is an array with one row per record of the log. The settling time is the time after
+which an error stays small. Signals that only figures show are in `presentation.plot_signals`.
 
 Invariant:
-    - Each signal has one definition, for figures, pages, summaries and metrics.
+    - Each signal has one definition, used by figures, pages, summaries and metrics alike.
     - The torques of operators and environment are reported as they act on the arm. Their sign
       is the opposite of the recorded tau_x, the external torque in Eq. (8) of the paper.
     - Empty logs give empty arrays.
@@ -41,9 +40,9 @@ P is 5 for the planar arm and 10 n for a chain.
 
 
 def follows_in_task_space(log: Log) -> bool:
-    """Returns True if the arms follow each other with their end effectors (tips).
+    """Returns True if the arms follow each other with their end effectors.
 
-    Their errors are then measured along axes in space. Otherwise, the errors are differences
+    In that case, errors are measured along spatial axes. Otherwise, they are differences
     between joint angles.
 
     Args:
@@ -56,8 +55,7 @@ def follows_in_task_space(log: Log) -> bool:
 def external_torques(site_log: SiteLog) -> Array:
     """Returns the torque of operator and environment ON the arm, shape (K, n), in N m.
 
-    The records contain tau_x, which Eq. (8) subtracts and which therefore has the opposite
-    sign.
+    The records contain tau_x, which has the opposite sign because Eq. (8) subtracts it.
     """
     return 0.0 - site_log.tau_x  # 0 - 0 is 0, but -0 would be printed as -0
 
@@ -83,14 +81,14 @@ class JointError(NamedTuple):
     def find_largest(cls, site_log: SiteLog, from_s: float = -math.inf) -> "JointError | None":
         """Finds the largest tracking error of an arm.
 
-        If several records have this error, the first of them is returned.
+        If several records have this error, the first one is returned.
 
         Args:
             site_log: Log of the site.
-            from_s: Time after which records count, in s.
+            from_s: Only records after this time are considered, in s.
 
         Returns:
-            The error. `None` if no record has a finite error.
+            The error, or `None` if no record has a finite error.
         """
         first = int(np.searchsorted(site_log.t_s, from_s, side="right"))
         errors = np.abs(joint_errors(site_log)[first:])
@@ -115,7 +113,7 @@ class JointError(NamedTuple):
             site_log: Log of the site.
 
         Returns:
-            The error. `None` if no record of that second has a finite error.
+            The error, or `None` if no record of that second has a finite error.
         """
         if not len(site_log):
             return None
@@ -131,7 +129,7 @@ class JointError(NamedTuple):
             log: Log of the run.
 
         Returns:
-            The error. `None` if no record of that second has a finite error.
+            The error, or `None` if no record of that second has a finite error.
         """
         errors = [JointError.find_in_last_second(log[site]) for site in log.sites]
         known = [error for error in errors if error is not None]
@@ -144,10 +142,10 @@ def largest_magnitude(values: Array) -> Array:
     For example, the row [0.1, -0.3] gives 0.3.
 
     Args:
-        values: Values, shape (K, n).
+        values: The array, shape (K, n).
 
     Returns:
-        The largest values, shape (K,). Zeros if a row has no entries.
+        The largest absolute values, shape (K,). Zeros if the rows have no entries.
     """
     magnitudes = np.abs(values)
     largest: Array = magnitudes.max(axis=1, initial=0.0)
@@ -157,13 +155,13 @@ def largest_magnitude(values: Array) -> Array:
 def largest_remaining_error(site_log: SiteLog) -> Array:
     """Returns the largest error from each record to the end of the run.
 
-    The arm has settled at the first record where this value is below a bound.
+    The arm has settled at the first record where this error is below a bound.
 
     Args:
         site_log: Log of the site.
 
     Returns:
-        Largest error, shape (K,). It never rises.
+        Largest error, shape (K,), which never increases.
     """
     largest = largest_magnitude(joint_errors(site_log))
     reversed_largest = largest[::-1]
@@ -177,8 +175,8 @@ def settling_time_s(site_log: SiteLog) -> float | None:
     This is the last time at which an error exceeded `SETTLED_ERROR_RAD`.
 
     Returns:
-        The time. 0 if no error ever exceeded the bound. `None` if the last record has an error
-            that exceeds it, or if there are no records.
+        The time, or 0 if no error ever exceeded the bound. `None` if the error of the last
+        record exceeds it, or if there are no records.
     """
     if not len(site_log):
         return None
@@ -203,7 +201,7 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
             not settled.
 
     Returns:
-        The largest time. `None` if some site has not settled.
+        The largest time, or `None` if a site has not settled.
     """
     settled_s = [time_s for time_s in times_s if time_s is not None]
     if len(settled_s) < len(times_s):
@@ -214,8 +212,8 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
     """Returns how far operators displaced a site, compared with a run without operators.
 
-    Arms also move without operators, for example while they synchronise. The difference of both
-    runs is the motion due to the operators alone.
+    Arms also move without operators, for example while they synchronise. The difference between
+    the two runs is the motion caused by the operators.
 
     Args:
         log: The log of the run.
@@ -223,7 +221,7 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
         site: Name of the site.
 
     Returns:
-        The ticks that both logs have, shape (K,).
+        The ticks present in both logs, shape (K,).
         Their times, shape (K,), in s.
         q of the log minus q of the twin, shape (K, n), in rad.
     """

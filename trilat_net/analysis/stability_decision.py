@@ -7,11 +7,11 @@ The decision combines all evidence on a run:
 - proofs that hold for its control loop: the stability theorem with all its premises, the
   stability condition of a control law, or the characteristic roots of the loop.
 
-The words mean:
+The four verdicts are:
 
 - Stable: a proof exists for this loop, and the run does not contradict it.
-- Settled: the run became slow or its motion was decaying (`run_end` has the limits), and every
-  push died away, but there is no proof.
+- Settled: the run became slow or its motion was decaying (`run_end` defines the limits), and
+  every push decayed, but there is no proof.
 - Not stable: the run diverged, oscillates, drifts or grows, or its loop has an exact root with
   a positive real part, and no proof contradicts this.
 - Open: everything else.
@@ -21,10 +21,10 @@ Invariant:
       open.
     - Roots count as a proof only if they are exact: delays are constant, or repeat after a
       known period over which the loop was analysed.
-    - Exact roots in the left half-plane exclude the word "not stable", except for a run in
-      which an arm exceeded its limits. Roots from numerical derivatives exclude this word if
-      the motion at the end of the run may be their slow decay.
-    - A decision names the evidence on which it rests.
+    - Exact roots in the left half-plane rule out the verdict "not stable", except for a run in
+      which an arm exceeded its limits. Roots from numerical derivatives rule it out if the
+      motion at the end of the run may be their slow decay.
+    - A decision names the evidence on which it is based.
     - Twins never change a decision for which `is_decided_by_roots` is true. A command may
       therefore skip them.
 """
@@ -56,10 +56,10 @@ _UNTREND_ENDS = (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 def decide_stability(run: RunFindings) -> StabilityDecision:
     """Decides from all evidence whether a run is stable, settled, not stable, or open.
 
-    The module's docstring defines these words.
+    The docstring of the module defines these verdicts.
 
     Args:
-        run: Everything that is known about the run.
+        run: All evidence on the run.
     """
     obstacles = _list_obstacles(run)
     decision = _decide_by_roots(run, obstacles)
@@ -96,7 +96,7 @@ def is_decided_by_roots(run: RunFindings) -> bool:
     This is the case if the run diverged, or if its exact roots and its end agree.
 
     Args:
-        run: The evidence on the run without twins.
+        run: The evidence on the run, excluding twins.
     """
     return _decide_by_roots(run, _list_obstacles(run)) is not None
 

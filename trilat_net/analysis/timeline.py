@@ -1,8 +1,8 @@
 """Lists the events of a run over time: commands, network delays, modes of the arms, alarms.
 
-For example, a command may change a delay at 5 s, or stop all arms at 8 s. A reader of a figure
-or of a judgement needs these times. The mode of an arm is what its controller does: it follows
-other arms, holds its position, brakes or returns.
+For example, a command may change a delay at 5 s, or stop all arms at 8 s. These times help to
+interpret a figure or a verdict. The mode of an arm is what its controller does: follow other
+arms, hold its position, brake or return.
 
 Invariant:
     - Every entry comes from the scenario or from a record. No entry is inferred from the motion
@@ -20,7 +20,7 @@ from ..core import HELD_OVERRUN_TICKS, DelayKind, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log
 from ..net import MODES, ModeMeaning
-from ..scenario import Change, LinkBase, describe_event, find_requester
+from ..scenario import Change, LinkBase
 
 
 class _AppliedChange(NamedTuple):
@@ -57,8 +57,8 @@ class _AppliedChange(NamedTuple):
         """A phrase for the user that describes the state after the change.
 
         For an order to a site, the phrase is the order and its length, for example "hold, 500
-        ticks". For a link, it describes the new delay, and for shares it lists the new shares
-        with the time of the transition, for example "m1 0.7, m2 0.3 within 2 s".
+        ticks". For a link, it describes the new delay. For shares, it lists the new shares with
+        the transition time, for example "m1 0.7, m2 0.3 within 2 s".
         """
         change = self.change
         if change.order:
@@ -89,7 +89,7 @@ class _ModeInterval(NamedTuple):
     def meaning(self) -> ModeMeaning:
         """A sentence on what the arm does in this mode, such as holding its position.
 
-        Names of modes such as "hold" explain too little to a reader.
+        Names of modes such as "hold" are too short for readers to understand.
         """
         return MODES[self.mode]
 
@@ -136,18 +136,18 @@ class _StatedModel(NamedTuple):
 
 
 class StatedLink(NamedTuple):
-    """Delay models that a network link had during a run, as the scenario and changes state.
+    """Delay models of a network link during a run, as stated by the scenario and its changes.
 
     Attributes:
-        models: The models in order of time. The first one is in force at the start, and each
-            change adds another.
+        models: The models in chronological order. The first one is in effect at the start, and
+            each change adds another.
     """
 
     models: tuple[_StatedModel, ...]
 
     @property
     def has_one_constant_delay(self) -> bool:
-        """True if the link delays every message equally, and loses none.
+        """True if the link delays every sample equally and loses none.
 
         The stability theorem requires constant delays.
         """
@@ -169,9 +169,9 @@ class Timeline:
 
     @cached_property
     def end_s(self) -> float:
-        """The time at which the last recorded control period ends, in s.
+        """End of the last recorded tick period, in s.
 
-        If there are no records, it is the planned end of the run.
+        If there are no records, the planned end of the run.
         """
         site_logs = [self._log[site] for site in self._log.sites]
         recorded_logs = [site_log for site_log in site_logs if len(site_log)]
@@ -184,11 +184,11 @@ class Timeline:
     def changes(self) -> list[_AppliedChange]:
         """All changes before the end of the run, in the order in which they took effect.
 
-        The records also name ticks that a site had to skip. Skipped ticks are included only if
-        the site skipped so many ticks that it held its position.
+        The records also list ticks that a site had to skip. Skipped ticks are included only if
+        the site skipped so many that it held its position.
 
         Raises:
-            LogError: A record names a change that is not valid.
+            LogError: A record names an invalid change.
         """
         log = self._log
         applied_changes = [
@@ -212,7 +212,7 @@ class Timeline:
                     if event is None:
                         sentence = change.describe()
                     else:
-                        sentence = describe_event(event.kind, event.text, event.command)
+                        sentence = Change.describe_event(event.kind, event.text, event.command)
                     applied_changes.append(_AppliedChange(change, site, tick, sentence))
 
         visible_entries = []
@@ -224,14 +224,13 @@ class Timeline:
 
     @cached_property
     def effective_commands(self) -> list[Change]:
-        """The commands that changed something, by the time at which they take effect.
+        """The commands that changed something, ordered by the time at which they take effect.
 
-        A command that sets a link, or the dominance factors of a site (the weights with which
-        it follows its peers), to their present values is left out. Orders to sites, such as
-        "stop", are always included.
+        A command that sets a link, or the dominance factors of a site, to their present values
+        is left out. Orders to sites, such as "stop", are always included.
 
         Raises:
-            LogError: A record names a change that is not valid.
+            LogError: A record names an invalid change.
         """
         scenario = self._log.scenario
         commands = []
@@ -262,10 +261,10 @@ class Timeline:
 
     @cached_property
     def stated_links(self) -> dict[str, StatedLink]:
-        """The delay models of every network link of the scenario, by the name "j->i".
+        """The delay models of every network link of the scenario, keyed by the name "j->i".
 
         Raises:
-            LogError: A record names a change that is not valid.
+            LogError: A record names an invalid change.
         """
         stated_links = {}
         for name, link in self._log.scenario.links.items():
@@ -278,16 +277,17 @@ class Timeline:
         return stated_links
 
     def find_mode_intervals(self, site: str) -> list[_ModeInterval]:
-        """Finds the times in which an arm did not follow the other arms, in order.
+        """Finds the time intervals in which an arm did not follow the other arms.
 
-        In these times the site, the process that runs the arm, held its position, slowed down
-        to a stop, or moved back to the motion that it should follow.
+        In these intervals the site held its position, slowed down to a stop, or moved back to
+        its reference.
 
         Args:
             site: Name of the site.
 
         Returns:
-            The intervals. Empty if the arm followed the others all the time.
+            The intervals in chronological order. Empty if the arm followed the others
+            throughout.
         """
         site_log = self._log[site]
         modes: list[str] = site_log.mode.tolist()
@@ -306,16 +306,16 @@ class Timeline:
 
     @cached_property
     def alarms(self) -> list[_RaisedAlarm]:
-        """The alarms of all arms, in the order of their start.
+        """The alarms of all arms, ordered by their start.
 
         If a person ordered an arm to stop, the reason of the alarm names this person.
 
         Raises:
-            LogError: A record names a change that is not valid.
+            LogError: A record names an invalid change.
         """
         log = self._log
         requesters = {
-            (entry.site, entry.taken_at_tick): find_requester(entry.sentence)
+            (entry.site, entry.taken_at_tick): Change.find_requester(entry.sentence)
             for entry in self.changes
         }
 

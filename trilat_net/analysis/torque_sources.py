@@ -1,10 +1,9 @@
-"""Splits the external torque on an arm into the torques of the operator and of the environment.
+"""Splits the external torque on an arm into the torques of the operator and the environment.
 
 A log contains only the sum of the torques with which operators and environments, such as
 virtual walls, push an arm. Metrics need them separately, for example to compute the work of the
-operator. The scenario (the description of the experiment) contains a model of each. This module
-evaluates the models for all records at once and splits the sum. All torques are those that act
-on the arm.
+operator. The scenario contains a model of each. This module evaluates the models for all
+records at once and splits the sum. All torques are those that act on the arm.
 
 Invariant:
     - Torques are computed from the definitions in the scenario, independently of the
@@ -42,8 +41,8 @@ class VirtualWall:
         source: Description of the wall.
         normal: Unit vector along which the wall pushes, shape (2,) or (3,).
         may_generate_energy: True if the wall is stiff, and its force is computed once per tick
-            (period of the control loop) and held. Other walls cannot generate energy, because
-            their force follows the motion of the arm.
+            and held. Other walls cannot generate energy, because their force follows the motion
+            of the arm.
     """
 
     def __init__(self, source: TorqueSource) -> None:
@@ -62,7 +61,7 @@ class VirtualWall:
         return [cls(actor) for actor in actors if actor.kind is TorqueKind.WALL]
 
     def find_depth(self, end_effector: EndEffectorRows) -> Array:
-        """Returns how deep the end effector (tip of the arm) is inside the wall, in m.
+        """Returns how deep the end effector is inside the wall, in m.
 
         The force of the wall grows with the depth. Outside the wall there is no force.
 
@@ -70,7 +69,7 @@ class VirtualWall:
             end_effector: Motion of the end effector over K poses.
 
         Returns:
-            Depth, shape (K,). It is negative outside the wall.
+            Depth, shape (K,), which is negative outside the wall.
         """
         surface_point = np.array(self.source.a)
         depth: Array = (surface_point - end_effector.position) @ self.normal
@@ -79,8 +78,9 @@ class VirtualWall:
     def find_force(self, t_s: Array, end_effector: EndEffectorRows) -> Array:
         """Returns the force of the wall along its normal, which pushes and never pulls.
 
-        The force is max(K depth - B outward speed, 0) inside the wall, with its stiffness K and
-        damping B. It is 0 outside, before the wall's start and after its end.
+        Inside the wall, the force is max(K depth - B outward speed, 0), with the stiffness K
+        and the damping B of the wall. It is 0 outside, before the wall's start and after its
+        end.
 
         Args:
             t_s: Times, shape (K,), in s.
@@ -102,7 +102,7 @@ class SourceRows:
     """A source of torque on an arm, evaluated at many times at once.
 
     The source may be an operator or an environment: a scripted torque, a spring, a damper, a
-    wall, a person who acts live, or a model that a user wrote.
+    wall, a person who acts live, or a model written by a user.
 
     Args:
         source: Description of the source.
@@ -114,8 +114,8 @@ class SourceRows:
     def find_target_motion(self, t_s: Array) -> tuple[Array, Array]:
         """Computes where the target of an operator's spring is, and how fast it moves.
 
-        An operator is modelled by a spring between the arm and a target. The target moves from
-        a to b on a path with minimum jerk.
+        The operator is modelled as a spring between the arm and a target. The target moves from
+        a to b along a minimum-jerk trajectory.
 
         Args:
             t_s: Times, shape (K,), in s.
@@ -178,7 +178,7 @@ class SourceRows:
     ) -> Array:
         """Returns the torque of a source that depends on the arm's motion.
 
-        The source may be a spring, a damper, a wall, or a model that a user wrote.
+        The source may be a spring, a damper, a wall, or a model written by a user.
 
         Args:
             t_s: Times, shape (K,), in s.
@@ -226,16 +226,16 @@ class SourceRows:
         qd: Array,
         end_effector: EndEffectorRows,
     ) -> Array:
-        """Computes the torque of an operator who acts live, on a web page or with a device.
+        """Computes the torque of an operator who acts live, through a web page or a device.
 
-        The operator's recorded action is a target to which a spring and a damper pull the arm,
-        or a force. The pull is reduced to the limit of the operator, and multiplied by the
-        firmness of the grip.
+        The operator's recorded action is either a force, or a target to which a spring and a
+        damper pull the arm. The pull is clipped to the limit of the operator, and multiplied by
+        the firmness of the grip.
 
         Args:
-            hand: Recorded action of the operator, see `HandInForce`, shape (K, h): the firmness
-                of the grip from 0 to 1, two further values, the target and the target's
-                velocity.
+            hand: Recorded action of the operator (see `HandInForce`), shape (K, h): the
+                firmness of the grip from 0 to 1, two further values, the target and the
+                target's velocity.
             q: Joint angles, shape (K, n), in rad.
             qd: Joint velocities, shape (K, n), in rad/s.
             end_effector: Motion of the end effector.
@@ -270,17 +270,16 @@ class SourceRows:
         return _map_to_joints(end_effector.J, effort)
 
     def compute_script(self, t_s: Array, J: Array) -> Array:
-        """Returns the plan of an operator as a torque that does not depend on the arm's motion.
+        """Returns an operator's plan as a torque that does not depend on the arm's motion.
 
         Metrics use the plan to find out when the operator acts, because the plan changes if and
-        only if the operator moves. The definition of the plan depends on the kind of the
-        operator:
+        only if the operator moves. How the plan is defined depends on the kind of operator:
 
         - Scripted torque (pulse, recorded, chirp, multisine): the torque itself.
         - Spring: K times the displacement of its target plus B times the target's speed. If the
           spring acts at the end effector, the Jacobian J of one pose maps this force to the
           joints.
-        - Model that a user wrote: its effort on an arm that rests at zero.
+        - Model written by a user: its effort on an arm that rests at zero.
 
         Args:
             t_s: Times, shape (K,), in s.
@@ -347,11 +346,11 @@ class SourceRows:
 
 
 class TorqueSplit(NamedTuple):
-    """The external torque on an arm, divided into those of operator and environment, in N m.
+    """The external torque on an arm, divided between operator and environment, in N m.
 
-    Each attribute has the shape (K, n) unless stated otherwise. Torques that follow the motion
-    continuously and torques that are computed once per tick do different work within a tick.
-    Therefore they are kept separate. The torque of the arm's mechanical stops is not included.
+    Each attribute has shape (K, n) unless stated otherwise. Torques that follow the motion
+    continuously and torques that are computed once per tick are kept separate, because they do
+    different work within a tick. The torque of the arm's mechanical stops is not included.
 
     Attributes:
         end_effector: Motion of the end effector.
@@ -359,9 +358,9 @@ class TorqueSplit(NamedTuple):
         operator_held: Operator's torque that is computed once per tick and held.
         environment_now: Environment's torque that follows the motion continuously.
         environment_held: Environment's torque that is computed once per tick and held.
-        script: The part of the operator's action that the scenario plans, see
-            `SourceRows.compute_script`. None if not requested, or if the operator's torque does
-            not agree with the scenario.
+        script: The part of the operator's action that the scenario plans (see
+            `SourceRows.compute_script`), or None if it was not requested or the operator's
+            torque does not agree with the scenario.
     """
 
     end_effector: EndEffectorRows
@@ -375,29 +374,28 @@ class TorqueSplit(NamedTuple):
     def operator(self) -> Array:
         """Total torque of the operator on the arm, shape (K, n), in N m.
 
-        It is the sum of a continuous torque and a torque that is held over a tick (control
-        period).
+        The sum of the continuous torque and the torque held over each tick.
         """
         return self.operator_now + self.operator_held
 
     @property
     def environment(self) -> Array:
-        """The torque of the environment, such as walls, on the arm, shape (K, n), in N m.
+        """Total torque of the environment, such as walls, on the arm, shape (K, n), in N m.
 
-        It is the sum of the continuous torque and the torque that is held over a tick.
+        The sum of the continuous torque and the torque held over each tick.
         """
         return self.environment_now + self.environment_held
 
     @classmethod
     def of_records(cls, records: AlignedRecords, scenario: Scenario) -> "TorqueSplit":
-        """Splits the recorded external torque on an arm into those of operator and environment.
+        """Splits the recorded external torque on an arm between operator and environment.
 
-        The environment's torque is computed from the scenario. The rest belongs to the
-        operator. Use `with_script` to find also what the scenario plans for the operator.
+        The environment's torque is computed from the scenario, and the rest is attributed to
+        the operator. Use `with_script` to also find what the scenario plans for the operator.
 
         Args:
-            records: Records of the arm's site, the process that runs the arm.
-            scenario: The description of the experiment.
+            records: Records of the site.
+            scenario: The scenario.
 
         Returns:
             The torques at every record. The attribute `script` is `None`.
@@ -408,12 +406,12 @@ class TorqueSplit(NamedTuple):
         end_effector = arm.place_end_effector(records.q, records.qd)
 
         def add_torques(actors: Iterable[TorqueSource], *, sampled: bool) -> Array:
-            """Returns the sum of the torques that the models of operators or environments give.
+            """Returns the sum of the torques that models of operators or environments compute.
 
             Args:
                 actors: The operators or environments.
-                sampled: True to add only torques that are computed once per tick and then
-                    constant. False to add only torques that follow the motion continuously.
+                sampled: True to add only torques that are computed once per tick and then held.
+                    False to add only torques that follow the motion continuously.
 
             Returns:
                 The sum in each of K records for each of n joints, shape (K, n).
@@ -456,15 +454,15 @@ class TorqueSplit(NamedTuple):
 
     @classmethod
     def with_script(cls, records: AlignedRecords, scenario: Scenario) -> "TorqueSplit":
-        """Splits the external torque on an arm into the torques of operator and environment.
+        """Splits the external torque on an arm between operator and environment, with the plan.
 
         The result also contains the torque that the scenario plans for the operator, if the
         recorded torque agrees with it. If the scenario has no operator, rounding errors are
         removed from the operator's torque.
 
         Args:
-            records: Records of the arm's site, the process that runs the arm.
-            scenario: The description of the experiment.
+            records: Records of the site.
+            scenario: The scenario.
 
         Returns:
             The torques at every record.
@@ -531,10 +529,11 @@ class WallEnergy(NamedTuple):
 
     Attributes:
         site: Site of the wall.
-        generated_j: Largest energy that the wall supplied to the joint motion beyond the energy
-            that its spring had stored.
-        required_damping_n_s_m: K h / 2 + B.
-        arm_damping_n_s_m: Smallest damping b of the arm itself along the normal during contact.
+        generated_j: Largest energy that the wall supplied to the joint motion in excess of the
+            energy that its spring had stored, in J.
+        required_damping_n_s_m: K h / 2 + B, in N s/m.
+        arm_damping_n_s_m: Smallest damping b of the arm itself along the normal during contact,
+            in N s/m.
     """
 
     site: str
@@ -547,7 +546,7 @@ class WallEnergy(NamedTuple):
         """Returns the number of walls in a scenario that may generate energy.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
         """
         walls = map(VirtualWall.list_of_site, scenario.sites.values())
         return sum(wall.may_generate_energy for wall in chain.from_iterable(walls))
@@ -556,8 +555,8 @@ class WallEnergy(NamedTuple):
     def list_of_log(cls, log: Log) -> list["WallEnergy"]:
         """Computes the energy that each virtual wall of a run generated by itself.
 
-        A real wall generates no energy. The force of a virtual wall is computed once per tick
-        and constant until the next tick. Therefore the wall may return more energy than it
+        A real wall generates no energy. The force of a virtual wall, however, is computed once
+        per tick and constant until the next tick, so the wall may return more energy than it
         received. Walls that follow the motion continuously are left out.
 
         Args:

@@ -291,7 +291,7 @@ def linear(
         ScenarioError: The scenario is not valid, or has no linear loop.
         UsageError: Another argument is not valid.
     """
-    from ..analysis import analyse_linear_loop, read_hands
+    from ..analysis import analyse_linear_loop
 
     try:
         angles = None if pose is None else tuple(map(float, pose))
@@ -309,7 +309,7 @@ def linear(
         roots=roots,
         over=over,
         ports=ports,
-        hands=read_hands(operators),
+        operators=operators,
     )
 
 

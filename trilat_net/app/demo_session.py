@@ -47,7 +47,6 @@ from ..core import compiling_notice, is_core_cached
 from ..files import refuse_link
 from ..log import Log, open_log
 from ..net import Clock, DefaultEndpoints, SystemClock, ZenohBus
-from ..own_code import list_imported_code
 from ..records import NS_PER_S
 from ..scenario import HandSite, check_outside_arms
 from .monitor import SessionDisplay, SessionMonitor
@@ -632,7 +631,7 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
     scenario = load_scenario(scenario_file)
 
     # A user's own code is imported only in the process that runs it.
-    if not list_imported_code([scenario]):
+    if not scenario.imported_code:
         # One site of each kind of arm suffices.
         sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
         for name in sites_by_counts.values():

@@ -19,7 +19,7 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -90,152 +90,6 @@ class DoctorFinding(NamedTuple):
     check: str
     state: FindingState
     text: str
-
-
-def examine_machine(
-    connection: Connection,
-    keys: Path | None,
-    folder: Path,
-    session: str | None,
-    clock: Clock,
-    *,
-    insecure: bool,
-) -> Iterator[DoctorFinding]:
-    """Checks whether this machine can run a session, and yields each result at once.
-
-    Some checks take seconds. The user sees each result as soon as it is known.
-
-    Args:
-        connection: Endpoints at which this machine would listen, or to which it would connect.
-        keys: Folder of a member's keys. `None` if there are no keys.
-        folder: Folder where results would be stored.
-        session: Name of a running session with whose members the clocks are compared. `None` if
-            the comparison is not made.
-        clock: Clock of this process.
-        insecure: True to permit connections without keys, because everybody on the network is
-            trusted.
-
-    Yields:
-        The findings, in the order of the checks.
-    """
-    member_keys = yield from examine_keys(keys)
-    yield from examine_links(connection, keys, member_keys, insecure=insecure)
-    yield from examine_clock(clock)
-    if session is not None:
-        secured_connection = connection.secure(member_keys, insecure=insecure)
-        yield from _examine_offsets(secured_connection, clock, session)
-    yield examine_system()
-    yield from examine_rights()
-    yield examine_rate()
-    yield from examine_room(folder)
-
-
-def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
-    """Checks whether a member's keys are valid, for how long, and whether others can read them.
-
-    Keys encrypt the connections of a session, and prove which process has sent a message.
-
-    Args:
-        folder: Folder of a member's keys. `None` if there are no keys.
-
-    Returns:
-        The keys. `None` if there are no keys, or if they cannot be used.
-
-    Yields:
-        The findings about the keys.
-    """
-    if folder is None:
-        yield DoctorFinding(
-            "keys", "ok", "no keys given: without --keys a member listens only on this machine"
-        )
-        return None
-
-    try:
-        member_keys = read_member_keys(folder)
-    except UsageError as error:
-        yield DoctorFinding("keys", "fail", str(error))
-        return None
-
-    names = ", ".join(member_keys.members)
-    description = (
-        f"keys of {member_keys.member} for {names}, "
-        f"valid until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
-    )
-    if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
-        yield DoctorFinding(
-            "keys",
-            "warn",
-            f"{description}: they expire soon; renew them with trilat keys renew",
-        )
-    else:
-        yield DoctorFinding("keys", "ok", description)
-
-    if read_foreign_permissions(folder):
-        yield DoctorFinding(
-            "keys", "warn", f"other users can read {folder}; run: chmod 700 {folder}"
-        )
-
-    # Anybody who has the key of the authority could create keys for further members.
-    authority = folder.resolve().parent / "authority" / PRIVATE_KEY
-    if authority.exists():
-        description = (
-            f"the authority's key {authority} should not be on this machine, because it "
-            "can create keys for anybody; keep it elsewhere"
-        )
-        yield DoctorFinding("keys", "warn", description)
-    return member_keys
-
-
-def examine_links(
-    connection: Connection,
-    folder: Path | None,
-    member_keys: MemberKeys | None,
-    *,
-    insecure: bool,
-) -> Iterator[DoctorFinding]:
-    """Checks whether each network endpoint can be opened or reached, and is encrypted.
-
-    An endpoint is an address with a protocol, such as "tls/[::1]:7447".
-
-    Args:
-        connection: Endpoints to listen at and to connect to.
-        folder: Folder of a member's keys. `None` if there are no keys.
-        member_keys: The keys. `None` if there are no keys, or if they cannot be used.
-        insecure: True to permit connections without keys, because everybody on the network is
-            trusted.
-
-    Yields:
-        The findings about the endpoints. There is a single finding if no endpoint can be used
-        at all.
-    """
-    try:
-        secured = connection.secure(member_keys, insecure=insecure)
-    except UsageError as error:
-        yield DoctorFinding("links", "fail", str(error))
-        return
-
-    for endpoint in secured.listen_addresses:
-        address = _split_address(endpoint)
-        if address is None:
-            yield _describe_untried(endpoint)
-        else:
-            yield _examine_listening(endpoint, address)
-
-    for endpoint in secured.connect_addresses:
-        address = _split_address(endpoint)
-        if endpoint.startswith("quic/"):
-            yield _examine_quic(endpoint, member_keys)
-        elif address is None:
-            yield _describe_untried(endpoint)
-        else:
-            yield _examine_reaching(endpoint, address, folder if member_keys else None)
-
-    if not secured.listen and not secured.connect:
-        yield DoctorFinding(
-            "links",
-            "ok",
-            "no endpoints given; --listen and --connect are tried if they are given",
-        )
 
 
 def _describe_untried(endpoint: str) -> DoctorFinding:
@@ -380,92 +234,6 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
     return host.strip("[]"), port
 
 
-def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
-    """Checks for `CLOCK_TEST_NS` whether the clocks of this machine run steadily.
-
-    The monotonic clock must not go back. The time of day must not step relative to the
-    monotonic clock. The finding also states the longest time between two readings, which shows
-    how long the operating system interrupts a process.
-
-    Args:
-        clock: Clock of this process.
-
-    Yields:
-        One finding about the clocks.
-    """
-    started_ns = clock.monotonic_ns()
-    wall_start_ns = clock.unix_ns()
-    previous_ns = started_ns
-    backward_steps = 0
-    longest_gap_ns = 0
-    while previous_ns - started_ns < CLOCK_TEST_NS:
-        now_ns = clock.monotonic_ns()
-        backward_steps += now_ns < previous_ns
-        longest_gap_ns = max(longest_gap_ns, now_ns - previous_ns)
-        previous_ns = now_ns
-
-    # If both clocks run steadily, they have advanced by the same time.
-    wall_elapsed_ns = clock.unix_ns() - wall_start_ns
-    elapsed_ns = clock.monotonic_ns() - started_ns
-    step_ns = abs(wall_elapsed_ns - elapsed_ns)
-
-    if backward_steps:
-        times_text = count_nouns(backward_steps, "time")
-        text = f"the monotonic clock went back {times_text} in 0.1 s"
-        yield DoctorFinding("clock", "fail", text)
-    elif step_ns > MAX_CLOCK_STEP_NS:
-        step_text = f"the wall clock stepped by {step_ns / 1e6:.1f} ms in 0.1 s"
-        yield DoctorFinding("clock", "warn", f"{step_text}; that distorts no record")
-    else:
-        longest_ms = longest_gap_ns / 1e6
-        text = f"steady; largest pause of a loop that never sleeps {longest_ms:.1f} ms"
-        yield DoctorFinding("clock", "ok", text)
-
-
-def _examine_offsets(
-    connection: Connection, clock: Clock, session: str
-) -> Iterator[DoctorFinding]:
-    """Compares the clock of this machine with the clocks of a session's other processes.
-
-    Measured delays of messages are only as accurate as the known offset between the clocks.
-
-    Args:
-        connection: Endpoints of the session, and keys.
-        clock: Clock of this process.
-        session: Name of the session.
-
-    Yields:
-        For each member, the offset of its clock and the error bound of the offset.
-    """
-    try:
-        measurement = ping_session(
-            connection=connection,
-            clock=clock,
-            session=session,
-            count=PINGS,
-            timeout_s=CONNECT_S,
-            stopped=lambda: False,
-        )
-    except (RunFailed, SessionError, UsageError) as error:
-        yield DoctorFinding("clock", "fail", str(error))
-        return
-
-    for member_row in measurement.members if measurement else ():
-        member = member_row["member"]
-        if member_row["same_clock"]:
-            yield DoctorFinding("clock", "ok", f"{member} has the same clock")
-        elif "offset_ns" not in member_row:
-            yield DoctorFinding("clock", "warn", f"{member} answered too few pings")
-        else:
-            offset_s = member_row["offset_ns"] / 1e9
-            bound_us = member_row["bound_us"]
-            text = (
-                f"the clock of {member} is {offset_s:+.6f} s ahead, known to {bound_us:.0f} us"
-            )
-            state: FindingState = "ok" if bound_us <= MAX_BOUND_US else "warn"
-            yield DoctorFinding("clock", state, text)
-
-
 def _run_in_process(code: str) -> Any:
     """Runs Python code in a new process, and returns the value that it prints.
 
@@ -501,50 +269,6 @@ _RIGHTS_CODE = (
 """Program that requests the real-time settings of a site, and prints the granted settings."""
 
 
-def examine_rights() -> Iterator[DoctorFinding]:
-    """Checks which real-time settings the operating system grants to a site.
-
-    For example, a site needs a high priority, so that its control loop is not interrupted by
-    other programs.
-
-    Yields:
-        One finding per setting, or a single warning if the settings could not be tried.
-    """
-    try:
-        obtained_settings: dict[str, str] = _run_in_process(_RIGHTS_CODE)
-    except ChildProcessError as error:
-        text = f"the settings could not be tried: the process that tries them failed ({error})"
-        yield DoctorFinding("rights", "warn", text)
-        return
-
-    wanted_settings = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
-    remedy = "ticks will be late by milliseconds under load: see compose.realtime.yaml"
-    for name, prefix in wanted_settings.items():
-        text = f"{name.replace('_', ' ')}: {obtained_settings[name]}"
-        if obtained_settings[name].startswith(prefix):
-            yield DoctorFinding("rights", "ok", text)
-        else:
-            yield DoctorFinding("rights", "warn", f"{text}; {remedy}")
-
-
-def examine_system() -> DoctorFinding:
-    """Reports which parts of the program work on this operating system.
-
-    Returns:
-        A single finding. It is "ok" on Linux. On other systems, it names the missing parts.
-    """
-    name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
-    if name == "Linux":
-        return DoctorFinding(
-            "system", "ok", "on Linux, live sessions and studies are both supported"
-        )
-    text = (
-        f"live sessions are supported only on Linux; on {name}, only simulation, logs and "
-        "studies are supported"
-    )
-    return DoctorFinding("system", "warn", text)
-
-
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
     """Measures how punctual the control loop is on this machine, at decreasing rates.
 
@@ -561,7 +285,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
     for rate_hz in RATES_HZ:
         if results:
             tried_rate_hz, tried_quantile_us, _ = results[-1]
-            if is_held(tried_rate_hz, tried_quantile_us):
+            if _is_held(tried_rate_hz, tried_quantile_us):
                 break
         scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
         warm_up(scenario, "s", clock)
@@ -572,7 +296,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
     return results
 
 
-def is_held(rate_hz: int, late_us: int) -> bool:
+def _is_held(rate_hz: int, late_us: int) -> bool:
     """Returns True if a machine achieves a tick rate, judged by how late its ticks begin.
 
     The rate is achieved if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
@@ -593,88 +317,373 @@ _RATES_CODE = (
 """
 
 
-def examine_rate() -> DoctorFinding:
-    """Measures the highest rate at which a control loop is punctual on this machine.
-
-    Each rate of `RATES_HZ`, such as 1000 Hz, is tried for `REHEARSAL_S`. The trials end with
-    the first rate at which the loop begins its periods on time.
-    """
-    if not is_core_cached():
-        return DoctorFinding(
-            "rate",
-            "warn",
-            "the rate was not measured, because the core is not compiled yet; see below",
-        )
-
-    try:
-        results: list[tuple[int, int, int]] = _run_in_process(_RATES_CODE)
-    except ChildProcessError as error:
-        text = f"the rate could not be measured: the process that measures it failed ({error})"
-        return DoctorFinding("rate", "warn", text)
-
-    # All rates before the last one were not achieved.
-    rate_hz, late_us, largest_us = results[-1]
-    missed_rates = results[:-1]
-    share_text = f"{MIN_PUNCTUAL_SHARE:.0%}"
-    text = (
-        f"{share_text} of the ticks began within {late_us / 1e3:.2f} ms of their time, "
-        f"all within {largest_us / 1e3:.1f} ms"
-    )
-
-    if not is_held(rate_hz, late_us):
-        text = f"a single site does not even achieve {rate_hz} Hz: {text}; end other programs"
-        return DoctorFinding("rate", "fail", text)
-
-    text = (
-        f"a single site achieves {rate_hz} Hz: {text} ({share_text} must begin within half a "
-        "period)"
-    )
-    if missed_rates:
-        missed_hz, missed_us, _ = missed_rates[-1]
-        text += f"; at {missed_hz} Hz, within {missed_us / 1e3:.2f} ms: lower rate_hz"
-    return DoctorFinding("rate", "warn" if missed_rates else "ok", text)
-
-
-def examine_room(folder: Path) -> Iterator[DoctorFinding]:
-    """Checks whether disk space, processors and compiled code suffice for a session.
-
-    If the control code has not been compiled and cached yet, the first run takes longer to
-    start.
+class MachineExamination:
+    """Examination whether this machine can run a session, with a method for each subject.
 
     Args:
-        folder: Folder where results would be stored. It need not exist.
+        connection: Endpoints at which this machine would listen, or to which it would connect.
+        keys: Folder of a member's keys. `None` if there are no keys.
+        folder: Folder where results would be stored.
+        session: Name of a running session with whose members the clocks are compared. `None` if
+            the comparison is not made.
+        clock: Clock of this process.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
     """
-    # The folder may be created later. Its nearest existing parent has the same disk.
-    candidates = (folder.absolute(), *folder.absolute().parents)
-    existing_folder = next(path for path in candidates if path.is_dir())
-    free_bytes = shutil.disk_usage(existing_folder).free
 
-    state: FindingState = "ok"
-    if free_bytes < MIN_FREE_BYTES:
-        state = "fail"
-    elif free_bytes < LOW_FREE_BYTES:
-        state = "warn"
-    if not os.access(existing_folder, os.W_OK):
-        yield DoctorFinding("disk", "fail", f"{existing_folder} cannot be written to")
-    yield DoctorFinding(
-        "disk", state, f"{free_bytes / 1e9:.1f} GB are free in {existing_folder}"
-    )
+    def __init__(
+        self,
+        connection: Connection,
+        keys: Path | None,
+        folder: Path,
+        session: str | None,
+        clock: Clock,
+        *,
+        insecure: bool,
+    ) -> None:
+        self._connection = connection
+        self._keys_folder = keys
+        self._folder = folder
+        self._session = session
+        self._clock = clock
+        self._insecure = insecure
+        self._member_keys: MemberKeys | None = None
+        self._keys_error = ""
+        if keys is not None:
+            try:
+                self._member_keys = read_member_keys(keys)
+            except UsageError as error:
+                self._keys_error = str(error)
 
-    cores = workers.count_cores()
-    waiting_programs = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    cores_text = count_nouns(cores, "processor")
-    text = f"{cores_text}, on which {waiting_programs:.1f} programs want to run"
-    warning = check_machine_load(SystemClock())
-    if warning:
-        text = f"{text}; {warning}"
-    is_overloaded = cores < 2 or waiting_programs >= cores or bool(warning)
-    yield DoctorFinding("processors", "warn" if is_overloaded else "ok", text)
+    def run(self) -> Iterator[DoctorFinding]:
+        """Performs all checks, and yields each result at once.
 
-    if is_core_cached():
-        yield DoctorFinding("core", "ok", "compiled")
-    else:
-        text = "not yet compiled: the first session here begins half a minute later"
-        yield DoctorFinding("core", "warn", text)
+        Some checks take seconds. The user sees each result as soon as it is known.
+
+        Yields:
+            The findings, in the order of the checks.
+        """
+        yield from self.check_keys()
+        yield from self.check_links()
+        yield from self.check_clock()
+        if self._session is not None:
+            yield from self._check_offsets(self._session)
+        yield self.check_system()
+        yield from self.check_rights()
+        yield self.check_rate()
+        yield from self.check_room()
+
+    def check_keys(self) -> Iterator[DoctorFinding]:
+        """Checks whether a member's keys are valid, for how long, and who can read them.
+
+        Keys encrypt the connections of a session, and prove which process has sent a message.
+
+        Yields:
+            The findings about the keys.
+        """
+        folder = self._keys_folder
+        if folder is None:
+            yield DoctorFinding(
+                "keys",
+                "ok",
+                "no keys given: without --keys a member listens only on this machine",
+            )
+            return
+
+        member_keys = self._member_keys
+        if member_keys is None:
+            yield DoctorFinding("keys", "fail", self._keys_error)
+            return
+
+        names = ", ".join(member_keys.members)
+        description = (
+            f"keys of {member_keys.member} for {names}, "
+            f"valid until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
+        )
+        if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
+            yield DoctorFinding(
+                "keys",
+                "warn",
+                f"{description}: they expire soon; renew them with trilat keys renew",
+            )
+        else:
+            yield DoctorFinding("keys", "ok", description)
+
+        if read_foreign_permissions(folder):
+            yield DoctorFinding(
+                "keys", "warn", f"other users can read {folder}; run: chmod 700 {folder}"
+            )
+
+        # Anybody who has the key of the authority could create keys for further members.
+        authority = folder.resolve().parent / "authority" / PRIVATE_KEY
+        if authority.exists():
+            description = (
+                f"the authority's key {authority} should not be on this machine, because it "
+                "can create keys for anybody; keep it elsewhere"
+            )
+            yield DoctorFinding("keys", "warn", description)
+
+    def check_links(self) -> Iterator[DoctorFinding]:
+        """Checks whether each network endpoint can be opened or reached, and is encrypted.
+
+        An endpoint is an address with a protocol, such as "tls/[::1]:7447".
+
+        Yields:
+            The findings about the endpoints. There is a single finding if no endpoint can be
+            used at all.
+        """
+        try:
+            secured = self._secure_connection()
+        except UsageError as error:
+            yield DoctorFinding("links", "fail", str(error))
+            return
+
+        for endpoint in secured.listen_addresses:
+            address = _split_address(endpoint)
+            if address is None:
+                yield _describe_untried(endpoint)
+            else:
+                yield _examine_listening(endpoint, address)
+
+        for endpoint in secured.connect_addresses:
+            address = _split_address(endpoint)
+            if endpoint.startswith("quic/"):
+                yield _examine_quic(endpoint, self._member_keys)
+            elif address is None:
+                yield _describe_untried(endpoint)
+            else:
+                folder = self._keys_folder if self._member_keys else None
+                yield _examine_reaching(endpoint, address, folder)
+
+        if not secured.listen and not secured.connect:
+            yield DoctorFinding(
+                "links",
+                "ok",
+                "no endpoints given; --listen and --connect are tried if they are given",
+            )
+
+    def check_clock(self) -> Iterator[DoctorFinding]:
+        """Checks for `CLOCK_TEST_NS` whether the clocks of this machine run steadily.
+
+        The monotonic clock must not go back. The time of day must not step relative to the
+        monotonic clock. The finding also states the longest time between two readings, which
+        shows how long the operating system interrupts a process.
+
+        Yields:
+            One finding about the clocks.
+        """
+        clock = self._clock
+        started_ns = clock.monotonic_ns()
+        wall_start_ns = clock.unix_ns()
+        previous_ns = started_ns
+        backward_steps = 0
+        longest_gap_ns = 0
+        while previous_ns - started_ns < CLOCK_TEST_NS:
+            now_ns = clock.monotonic_ns()
+            backward_steps += now_ns < previous_ns
+            longest_gap_ns = max(longest_gap_ns, now_ns - previous_ns)
+            previous_ns = now_ns
+
+        # If both clocks run steadily, they have advanced by the same time.
+        wall_elapsed_ns = clock.unix_ns() - wall_start_ns
+        elapsed_ns = clock.monotonic_ns() - started_ns
+        step_ns = abs(wall_elapsed_ns - elapsed_ns)
+
+        if backward_steps:
+            times_text = count_nouns(backward_steps, "time")
+            text = f"the monotonic clock went back {times_text} in 0.1 s"
+            yield DoctorFinding("clock", "fail", text)
+        elif step_ns > MAX_CLOCK_STEP_NS:
+            step_text = f"the wall clock stepped by {step_ns / 1e6:.1f} ms in 0.1 s"
+            yield DoctorFinding("clock", "warn", f"{step_text}; that distorts no record")
+        else:
+            longest_ms = longest_gap_ns / 1e6
+            text = f"steady; largest pause of a loop that never sleeps {longest_ms:.1f} ms"
+            yield DoctorFinding("clock", "ok", text)
+
+    def _check_offsets(self, session: str) -> Iterator[DoctorFinding]:
+        """Compares the clock of this machine with the clocks of a session's other processes.
+
+        Measured delays of messages are only as accurate as the known offset between the clocks.
+
+        Args:
+            session: Name of the session.
+
+        Yields:
+            For each member, the offset of its clock and the error bound of the offset.
+        """
+        connection = self._secure_connection()
+        try:
+            measurement = ping_session(
+                connection=connection,
+                clock=self._clock,
+                session=session,
+                count=PINGS,
+                timeout_s=CONNECT_S,
+                stopped=lambda: False,
+            )
+        except (RunFailed, SessionError, UsageError) as error:
+            yield DoctorFinding("clock", "fail", str(error))
+            return
+
+        for member_row in measurement.members if measurement else ():
+            member = member_row["member"]
+            if member_row["same_clock"]:
+                yield DoctorFinding("clock", "ok", f"{member} has the same clock")
+            elif "offset_ns" not in member_row:
+                yield DoctorFinding("clock", "warn", f"{member} answered too few pings")
+            else:
+                offset_s = member_row["offset_ns"] / 1e9
+                bound_us = member_row["bound_us"]
+                ahead_text = f"the clock of {member} is {offset_s:+.6f} s ahead"
+                text = f"{ahead_text}, known to {bound_us:.0f} us"
+                state: FindingState = "ok" if bound_us <= MAX_BOUND_US else "warn"
+                yield DoctorFinding("clock", state, text)
+
+    @staticmethod
+    def check_system() -> DoctorFinding:
+        """Reports which parts of the program work on this operating system.
+
+        Returns:
+            A single finding. It is "ok" on Linux. On other systems, it names the missing parts.
+        """
+        name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
+        if name == "Linux":
+            return DoctorFinding(
+                "system", "ok", "on Linux, live sessions and studies are both supported"
+            )
+        text = (
+            f"live sessions are supported only on Linux; on {name}, only simulation, logs and "
+            "studies are supported"
+        )
+        return DoctorFinding("system", "warn", text)
+
+    @staticmethod
+    def check_rights() -> Iterator[DoctorFinding]:
+        """Checks which real-time settings the operating system grants to a site.
+
+        For example, a site needs a high priority, so that its control loop is not interrupted
+        by other programs.
+
+        Yields:
+            One finding per setting, or a single warning if the settings could not be tried.
+        """
+        try:
+            obtained_settings: dict[str, str] = _run_in_process(_RIGHTS_CODE)
+        except ChildProcessError as error:
+            text = (
+                f"the settings could not be tried: the process that tries them failed ({error})"
+            )
+            yield DoctorFinding("rights", "warn", text)
+            return
+
+        wanted_settings = {
+            "scheduling": "SCHED_FIFO",
+            "memory": "locked",
+            "timer_slack": "1 ns",
+        }
+        remedy = "ticks will be late by milliseconds under load: see compose.realtime.yaml"
+        for name, prefix in wanted_settings.items():
+            text = f"{name.replace('_', ' ')}: {obtained_settings[name]}"
+            if obtained_settings[name].startswith(prefix):
+                yield DoctorFinding("rights", "ok", text)
+            else:
+                yield DoctorFinding("rights", "warn", f"{text}; {remedy}")
+
+    @staticmethod
+    def check_rate() -> DoctorFinding:
+        """Measures the highest rate at which a control loop is punctual on this machine.
+
+        Each rate of `RATES_HZ`, such as 1000 Hz, is tried for `REHEARSAL_S`. The trials end
+        with the first rate at which the loop begins its periods on time.
+        """
+        if not is_core_cached():
+            return DoctorFinding(
+                "rate",
+                "warn",
+                "the rate was not measured, because the core is not compiled yet; see below",
+            )
+
+        try:
+            results: list[tuple[int, int, int]] = _run_in_process(_RATES_CODE)
+        except ChildProcessError as error:
+            text = (
+                f"the rate could not be measured: the process that measures it failed ({error})"
+            )
+            return DoctorFinding("rate", "warn", text)
+
+        # All rates before the last one were not achieved.
+        rate_hz, late_us, largest_us = results[-1]
+        missed_rates = results[:-1]
+        share_text = f"{MIN_PUNCTUAL_SHARE:.0%}"
+        text = (
+            f"{share_text} of the ticks began within {late_us / 1e3:.2f} ms of their time, "
+            f"all within {largest_us / 1e3:.1f} ms"
+        )
+
+        if not _is_held(rate_hz, late_us):
+            text = (
+                f"a single site does not even achieve {rate_hz} Hz: {text}; end other programs"
+            )
+            return DoctorFinding("rate", "fail", text)
+
+        text = (
+            f"a single site achieves {rate_hz} Hz: {text} ({share_text} must begin within "
+            "half a period)"
+        )
+        if missed_rates:
+            missed_hz, missed_us, _ = missed_rates[-1]
+            text += f"; at {missed_hz} Hz, within {missed_us / 1e3:.2f} ms: lower rate_hz"
+        return DoctorFinding("rate", "warn" if missed_rates else "ok", text)
+
+    def check_room(self) -> Iterator[DoctorFinding]:
+        """Checks whether disk space, processors and compiled code suffice for a session.
+
+        If the control code has not been compiled and cached yet, the first run takes longer to
+        start.
+
+        The folder for results need not exist.
+        """
+        # The folder may be created later. Its nearest existing parent has the same disk.
+        folder = self._folder.absolute()
+        candidates = (folder, *folder.parents)
+        existing_folder = next(path for path in candidates if path.is_dir())
+        free_bytes = shutil.disk_usage(existing_folder).free
+
+        state: FindingState = "ok"
+        if free_bytes < MIN_FREE_BYTES:
+            state = "fail"
+        elif free_bytes < LOW_FREE_BYTES:
+            state = "warn"
+        if not os.access(existing_folder, os.W_OK):
+            yield DoctorFinding("disk", "fail", f"{existing_folder} cannot be written to")
+        yield DoctorFinding(
+            "disk", state, f"{free_bytes / 1e9:.1f} GB are free in {existing_folder}"
+        )
+
+        cores = workers.count_cores()
+        waiting_programs = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+        cores_text = count_nouns(cores, "processor")
+        text = f"{cores_text}, on which {waiting_programs:.1f} programs want to run"
+        warning = check_machine_load(SystemClock())
+        if warning:
+            text = f"{text}; {warning}"
+        is_overloaded = cores < 2 or waiting_programs >= cores or bool(warning)
+        yield DoctorFinding("processors", "warn" if is_overloaded else "ok", text)
+
+        if is_core_cached():
+            yield DoctorFinding("core", "ok", "compiled")
+        else:
+            text = "not yet compiled: the first session here begins half a minute later"
+            yield DoctorFinding("core", "warn", text)
+
+    def _secure_connection(self) -> Connection:
+        """Returns the endpoints with the member's keys.
+
+        Raises:
+            UsageError: The endpoints are open to other machines without keys.
+        """
+        return self._connection.secure(self._member_keys, insecure=self._insecure)
 
 
 @dataclass(frozen=True, repr=False)
@@ -750,7 +759,7 @@ def doctor(
     Raises:
         UsageError: An endpoint or the keys cannot be used.
     """
-    findings = examine_machine(
+    examination = MachineExamination(
         connection=Connection.of_member(listen, connect, router),
         keys=None if keys is None else Path(keys),
         folder=Path(folder),
@@ -758,4 +767,4 @@ def doctor(
         clock=SystemClock(),
         insecure=insecure,
     )
-    return DoctorReport(list(findings))
+    return DoctorReport(list(examination.run()))

@@ -7,6 +7,7 @@ Invariant:
     - The measurement does not disturb the publishers. This process only receives.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,9 @@ from ..signals import Interrupt
 
 _POLL_NS = 10_000_000
 """Pause between two checks whether the measurement is over, in ns."""
+_BARS = " ▁▂▃▄▅▆▇█"
+"""Bars of a histogram in text, by their height in eighths."""
+_DELAY_KEYS = ("min", "p50", "p99", "max")
 
 
 def ping_topic(
@@ -62,7 +66,7 @@ def ping_topic(
         raise RouterSilent(f"{silent}; {ROUTER_ADVICE}") from None
 
     with graph, Interrupt() as interrupt:
-        return measure_topic_delays(graph, clock, name, lasts_s, interrupt.is_requested)
+        return TopicDelays.measure(graph, clock, name, lasts_s, interrupt.is_requested)
 
 
 @dataclass(frozen=True, repr=False)
@@ -90,75 +94,118 @@ class TopicDelays(Result):
         return self.publishers
 
     def blocks(self) -> Iterator[Any]:
-        """Returns the table of delays that `trilat ping --ros2` prints.
+        """Yields the table of delays that `trilat ping --ros2` prints.
 
-        The module that composes the texts is imported inside this method, because a program
-        that only reads the numbers does not need it.
+        There is a row per publishing program. The last column is a histogram of the delays,
+        from the smallest to the largest one. The class of the table is imported inside this
+        method, because a program that only reads the numbers does not need it.
         """
-        from ..presentation import compose_topic_delays
+        from ..presentation import TextTable
 
-        return compose_topic_delays(self)
+        duration = f"{self.lasted_s:.3g} s"
+        yield f"/{self.topic}, {duration}; times in us, from sending to arrival"
 
+        rows = []
+        has_negative_delay = False
+        for publisher in self.publishers:
+            delays_us = publisher["delay_us"]
+            if delays_us["min"] < 0.0:
+                has_negative_delay = True
 
-def measure_topic_delays(
-    graph: Ros2Graph,
-    clock: Clock,
-    topic: str,
-    lasts_s: float,
-    stopped: Callable[[], bool],
-) -> TopicDelays:
-    """Measures the delays of a ROS 2 topic, from the sending time that each message carries.
+            cells = [
+                publisher["gid"][:8],
+                publisher["type"],
+                str(publisher["messages"]),
+                str(publisher["lost"]),
+                f"{publisher['rate_hz']:.1f}",
+            ]
+            cells += [f"{delays_us[key]:.0f}" for key in _DELAY_KEYS]
+            cells.append(_draw_histogram(publisher["histogram"]["counts"]))
+            rows.append(cells)
+        headers = ("publisher", "type", "messages", "lost", "Hz", *_DELAY_KEYS, "min to max")
+        yield TextTable(headers, rows, align="llrrrrrrrl")
 
-    The function receives the messages of the topic for some time, and then evaluates them for
-    each program that publishes on the topic.
+        if has_negative_delay:
+            yield "delays below 0: the publisher's clock is ahead of the clock of this machine"
+        yield "between two machines, delays contain the offset of the clocks"
 
-    Args:
-        graph: Connection to the ROS 2 programs.
-        clock: Clock of this process.
-        topic: Name of the topic.
-        lasts_s: Duration of the measurement, in s.
-        stopped: Function that returns True to end the measurement earlier.
+    @classmethod
+    def measure(
+        cls,
+        graph: Ros2Graph,
+        clock: Clock,
+        topic: str,
+        lasts_s: float,
+        stopped: Callable[[], bool],
+    ) -> "TopicDelays":
+        """Measures the delays of a ROS 2 topic, from the sending time in each message.
 
-    Raises:
-        RunFailed: No program has published on the topic.
-    """
-    # Number and delay of each message, and the type of the messages, by publisher.
-    samples: dict[bytes, list[tuple[int, int]]] = {}
-    types: dict[bytes, str] = {}
-
-    def receive(kind: str, attachment: Attachment) -> None:
-        """Stores the number and the delay of a ROS 2 message for the program that sent it.
-
-        The function is called in a thread of the network library Zenoh.
+        The method receives the messages of the topic for some time, and then evaluates them
+        for each program that publishes on the topic.
 
         Args:
-            kind: Type of the message.
-            attachment: Additional data of the message: its publisher, number and sending time.
+            graph: Connection to the ROS 2 programs.
+            clock: Clock of this process.
+            topic: Name of the topic.
+            lasts_s: Duration of the measurement, in s.
+            stopped: Function that returns True to end the measurement earlier.
+
+        Raises:
+            RunFailed: No program has published on the topic.
         """
-        delay_ns = clock.unix_ns() - attachment.sent_unix_ns
-        types[attachment.gid] = kind
-        samples.setdefault(attachment.gid, []).append((attachment.number, delay_ns))
+        # Number and delay of each message, and the type of the messages, by publisher.
+        samples: dict[bytes, list[tuple[int, int]]] = {}
+        types: dict[bytes, str] = {}
 
-    graph.tap(topic, receive)
-    begun_ns = clock.monotonic_ns()
-    while not stopped() and clock.monotonic_ns() - begun_ns < lasts_s * NS_PER_S:
-        clock.sleep_until(clock.monotonic_ns() + _POLL_NS)
-    lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
+        def receive(kind: str, attachment: Attachment) -> None:
+            """Stores the number and the delay of a ROS 2 message for the program that sent it.
 
-    if not samples:
-        raise RunFailed(
-            f"no publisher sent a message on /{topic} in {lasted_s:.3g} s: check the topic "
-            "with ros2 topic list, and the domain with --domain"
-        )
+            The function is called in a thread of the network library Zenoh.
 
-    publishers = []
-    # The lists are copied, because messages still arrive.
-    for gid, publisher_samples in list(samples.items()):
-        # DDS calls a type "std_msgs::msg::dds_::Bool_" that ROS calls "std_msgs/msg/Bool".
-        kind = types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
-        delays = _describe_delays(list(publisher_samples), lasted_s)
-        publishers.append({"gid": gid.hex(), "type": kind} | delays)
-    return TopicDelays(topic, lasted_s, publishers)
+            Args:
+                kind: Type of the message.
+                attachment: Additional data of the message: its publisher, number and sending
+                    time.
+            """
+            delay_ns = clock.unix_ns() - attachment.sent_unix_ns
+            types[attachment.gid] = kind
+            samples.setdefault(attachment.gid, []).append((attachment.number, delay_ns))
+
+        graph.tap(topic, receive)
+        begun_ns = clock.monotonic_ns()
+        while not stopped() and clock.monotonic_ns() - begun_ns < lasts_s * NS_PER_S:
+            clock.sleep_until(clock.monotonic_ns() + _POLL_NS)
+        lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
+
+        if not samples:
+            raise RunFailed(
+                f"no publisher sent a message on /{topic} in {lasted_s:.3g} s: check the topic "
+                "with ros2 topic list, and the domain with --domain"
+            )
+
+        publishers = []
+        # The lists are copied, because messages still arrive.
+        for gid, publisher_samples in list(samples.items()):
+            # DDS calls a type "std_msgs::msg::dds_::Bool_" that ROS calls "std_msgs/msg/Bool".
+            kind = types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
+            delays = _describe_delays(list(publisher_samples), lasted_s)
+            publishers.append({"gid": gid.hex(), "type": kind} | delays)
+        return cls(topic, lasted_s, publishers)
+
+
+def _draw_histogram(counts: Sequence[int]) -> str:
+    """Draws a histogram as one line of text, with a block character for each bin.
+
+    Args:
+        counts: Number of messages in each bin. At least one bin must have a message.
+    """
+    largest = max(counts)
+    bars = ""
+    for count in counts:
+        # Rounded up, so that a bin with a single message has a visible bar.
+        height_eighths = math.ceil(8 * count / largest)
+        bars += _BARS[height_eighths]
+    return bars
 
 
 def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from typing import Any
 from trilat_net.entry_points import HOOKS, load_entry
 from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
 from trilat_net.net import topics
-from trilat_net.scenario import Scenario, embedded_names_reader, parse_embedded
+from trilat_net.scenario import Scenario, parse_embedded
 
 from ..net import (
     OPERATOR,
@@ -218,8 +218,7 @@ class RunningSession:
             self._connection,
             self._clock,
             self.name,
-            # The names of the sites are read from the scenario in a site's reply.
-            embedded_names_reader(self.name),
+            self._read_site_names,
             stopped=_never_stopped,
             timeout_s=timeout_s,
         ) as bus:
@@ -306,7 +305,7 @@ class RunningSession:
             device_hand = make_device_hand(
                 hand=hand,
                 device=device,
-                settings=live.device,
+                operator=live,
                 clock=self._clock,
                 reach=scenario.arms[site].reach,
             )
@@ -491,6 +490,10 @@ class RunningSession:
         members = SessionMembers(bus, self._clock, self.name)
         return members.find(stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S)
 
+    def _read_site_names(self, text: str) -> tuple[str, ...]:
+        """Returns the names of the sites from the text of the scenario in a site's reply."""
+        return parse_embedded(text, self.name).names
+
     def _find_running(self, bus: Bus, site: str) -> Info:
         """Waits for the reply of one site, and checks that the site runs.
 
@@ -508,7 +511,6 @@ class RunningSession:
             SessionError: The session has no such site or has not begun, or the site does not
                 reply in time.
         """
-        read_names = embedded_names_reader(self.name)
         for info in self._find_members(bus):
             if info.member == site:
                 if not info.running:
@@ -517,7 +519,7 @@ class RunningSession:
                     )
                 return info
 
-            names = read_names(info.scenario) if info.scenario else ()
+            names = self._read_site_names(info.scenario) if info.scenario else ()
             if names and site not in names:
                 known = f"its sites are {', '.join(names)}"
                 raise SessionError(f"session {self.name!r} has no site {site!r}; {known}")

@@ -1,8 +1,8 @@
-"""Simulates experiments, and executes the runs of logs again.
+"""Simulates experiments, and re-executes the runs stored in logs.
 
-`virtual` simulates an experiment without real clocks and network. `verification` executes a log
-again, to check that it is correct. `what_if` does so with other settings, to show what would
-have happened. `fused` simulates runs for studies, without writing logs.
+`virtual` simulates an experiment without real clocks or a network. `verification` re-executes a
+log to check that it is correct. `what_if` re-executes a log with other settings, to show what
+would have happened. `fused` simulates runs for studies, without writing logs.
 """
 
 from typing import TYPE_CHECKING

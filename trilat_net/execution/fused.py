@@ -1,17 +1,17 @@
 """Simulates an experiment about 1000 times faster than real time, without writing a log.
 
-All arms of the experiment are simulated in one compiled loop. The loop does not store every
-tick (period of the control loop). It stores the largest values of every interval of 50 ms, and
-sums over the run. Parameter sweeps use this module, and so does the repetition of runs with a
-small disturbance, which shows whether they are stable.
+All arms of the experiment are simulated in one compiled loop. Instead of storing every tick,
+the loop stores maxima over intervals of 50 ms, and sums over the run. Parameter sweeps use this
+module. It is also used to repeat runs with a small disturbance, which shows whether they are
+stable.
 
 Invariant:
-    - The results equal the results of `execution.virtual` with its default network, bit for
-      bit. Scenarios that the compiled loop cannot execute are rejected.
-    - A run with the inputs of a log (arrived states and applied changes) equals the recorded
-      run, bit for bit. The state that a site receives may carry a time stamp in the future,
-      because the clocks of two computers may differ. It is then delivered in the first tick
-      after the stamp, because a site does not use it earlier.
+    - The results are bit-identical to those of `execution.virtual` with its default network.
+      Scenarios that the compiled loop cannot execute are rejected.
+    - A run with the inputs from a log (received samples and applied changes) is bit-identical
+      to the recorded run. Because the clocks of two computers may differ, a received sample may
+      carry a time stamp in the future. It is then delivered in the first tick after the stamp,
+      since a site does not use it earlier.
 """
 
 import math
@@ -22,13 +22,11 @@ import numpy as np
 from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, LinkSchedule, RunInputs
 from ..errors import ScenarioError, count_nouns
 from ..log import Log
-from ..own_code import find_user_laws
 from ..records import NS_PER_S
 from ..scenario import (
     HandPlayer,
     PlantPlayer,
     Scenario,
-    make_hand_players,
 )
 
 
@@ -39,27 +37,27 @@ def _find_largest_ratio(scenario: Scenario) -> int:
 
 
 class FusedRun(CompiledRun):
-    """Simulation of all arms of a scenario in one compiled loop.
+    """Simulates all arms of a scenario in one compiled loop.
 
-    A site is a process that runs one arm and its control loop. `CompiledRun` describes which
-    programs are called in addition to the loop.
+    `CompiledRun` describes which programs are called in addition to the loop.
 
     Args:
         scenario: The scenario.
         settled_rad: A site counts as settled while |e| of all joints is below this limit, in
             rad.
-        keep: Number of recent records of each site that are stored for `pop_records`.
+        keep: Number of most recent records per site that are kept for `pop_records`.
         inputs: Inputs of a recorded run that is repeated. The scenario's programs then do not
             act as operators, because their actions are part of the inputs.
-        hands: Live operators by site. They replace the programs that the scenario names.
-        plants: Users' programs that move external arms, by site.
+        hands: Mapping from site to live operator. They replace the programs named in the
+            scenario.
+        plants: Mapping from site to the user's program that moves its external arm.
 
     Attributes:
         scenario: The scenario.
 
     Raises:
-        ScenarioError: The loop cannot execute the scenario, see `check_scenario`, or a
-            law cannot be created.
+        ScenarioError: The loop cannot execute the scenario, see `check_scenario`, or a law
+            cannot be created.
     """
 
     def __init__(
@@ -76,7 +74,7 @@ class FusedRun(CompiledRun):
         setups = [scenario.setup(name) for name in names]
         live_hands: Mapping[str, HandPlayer] = {}
         if inputs is None:
-            live_hands = {**make_hand_players(scenario), **hands}
+            live_hands = {**HandPlayer.make_all(scenario), **hands}
         # The torque sources of a site are its operators, followed by its environment.
         first_environments = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
@@ -95,20 +93,19 @@ class FusedRun(CompiledRun):
 
     @staticmethod
     def check_scenario(scenario: Scenario, plants: Collection[str] = ()) -> None:
-        """Checks that the compiled loop can execute a scenario.
+        """Raises ScenarioError if the compiled loop cannot execute a scenario.
 
         The loop computes the motion of all arms itself. It cannot use a real robot, and a
         user's program may move an arm only if the caller provides that program.
 
         Args:
-            scenario: Description of the experiment.
-            plants: Names of the sites for which the caller provides a user's program that
-                computes the motion of the arm. By default, there are no such sites.
+            scenario: The scenario.
+            plants: Names of the sites for which the caller provides a program that computes the
+                motion of the arm.
 
         Raises:
             ScenarioError: Another arm is external, or the tick rates differ so much that too
-                many samples (sent states) would arrive in one tick (control period) of the
-                slowest site.
+                many samples would arrive in one tick of the slowest site.
         """
         scenario.refuse_external_arms(plants)
         ratio = _find_largest_ratio(scenario)
@@ -125,21 +122,21 @@ class FusedRun(CompiledRun):
     def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
         """Explains why the compiled loop cannot repeat a run exactly from its log alone.
 
-        For example, the log may lack records (results of control periods), or a control law may
-        be code that must not run here.
+        For example, the log may lack records, or a control law may be code that must not run
+        here.
 
         Args:
             log: Log of the run.
-            own_laws: True if control laws that are code of users may run.
+            own_laws: True if control laws written by users may run.
 
         Returns:
-            A reason for the user. Empty if the run can be repeated.
+            The reason, for the user, or an empty string if the run can be repeated.
         """
         scenario = log.scenario
         if scenario.external:
             arms = ", ".join(sorted(scenario.external))
             return f"the reaction of the external arm of {arms} is not known"
-        if find_user_laws(scenario) and not own_laws:
+        if scenario.inspect_user_laws() and not own_laws:
             return "the imported control laws may not run (permit them with --law FILE)"
         if set(log.executed_sites) != set(log.sites):
             return "in a rerun, the sites whose records were copied did not react"
@@ -151,21 +148,20 @@ class FusedRun(CompiledRun):
 
     @staticmethod
     def read_inputs(log: Log) -> RunInputs:
-        """Reads from a log everything that is needed to repeat its run.
+        """Reads everything that is needed to repeat a run from its log.
 
-        These inputs are the ticks (periods of the control loop) in which samples (sent states)
-        of other sites arrived, the changes of settings, and the actions of live operators
-        (persons or programs that moved an arm). The run must be repeatable, see
-        `explain_not_repeatable`.
+        The inputs are the ticks in which samples from other sites arrived, the changes of
+        settings, and the actions of live operators (people or programs that moved an arm). The
+        run must be repeatable, see `explain_not_repeatable`.
 
         Args:
             log: Log of the run.
 
         Returns:
-            The inputs, as the argument `inputs`.
+            The inputs, for the argument `inputs` of this class.
 
         Raises:
-            LogError: The log contains a text that is not a change of the scenario.
+            LogError: The log contains an entry that is not a valid change of the scenario.
         """
         names = log.scenario.names
         ticks = max(len(log[name]) for name in log.sites)
@@ -185,7 +181,7 @@ class FusedRun(CompiledRun):
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
-    """Returns the changes of all sites in order of time, in the form of `RunInputs`."""
+    """Returns the changes of all sites in order of time, in the format of `RunInputs`."""
     timed_changes = []
     for i, name in enumerate(log.scenario.names):
         rate_hz = log[name].rate_hz
@@ -197,14 +193,14 @@ def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
 
 
 def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
-    """Returns the arrivals of a log in the form of `ReplayedInputs`.
+    """Returns the arrivals from a log, in the format of `ReplayedInputs`.
 
     For each site and peer, the samples are sorted by the tick in which they are delivered. An
-    index states for each tick which sample of this list is the first to be delivered in it.
+    index gives, for each tick, the first sample in this list that is delivered in it.
 
     Args:
         log: The log.
-        ticks: Largest number of ticks of a site.
+        ticks: Largest number of ticks of any site.
 
     Returns:
         The index (`first`), the ticks of the samples (`samples`), and the largest time from the

@@ -1,13 +1,13 @@
-"""Checks a log by executing its run again, and reports one finding for each check.
+"""Checks a log by re-executing its run, and reports one finding per check.
 
-A log contains the inputs and the results of every control period. Therefore the results can be
-computed again. The checks answer these questions:
+A log contains the inputs and the results of every tick, so the results can be computed again.
+The checks answer these questions:
 
-- Are records missing, and is the file as it was written?
-- Does the scenario, the description of the experiment, have the hash that the log states?
-- Which control laws of users does the scenario name?
-- Does a repeated execution give the same records?
-- Does a simulation of the whole session, without clocks and network, give the same records?
+- Are records missing, and is the file unchanged since it was written?
+- Does the scenario match the hash stated in the log?
+- Which control laws written by users does the scenario name?
+- Does re-execution give the same records?
+- Does a simulation of the whole session, without clocks or a network, give the same records?
 - Was an arm moved by something outside this program, such as a real robot?
 
 Invariant:
@@ -29,26 +29,25 @@ from ..log import (
     describe_unknown_ends,
     open_log,
 )
-from ..own_code import CodeConsents, allowed_code, find_user_laws
+from ..own_code import CodeConsents, allowed_code
 from .verification import VerifyResult, verify_log
 from .virtual_comparison import compare_with_virtual
 
 _MAX_GAPS_NAMED = 60
-"""Largest number of gaps that a finding lists."""
+"""Maximum number of gaps that a finding lists."""
 
 
 @dataclass(frozen=True, repr=False)
 class LogCheckReport(CheckReport):
     """Findings of all checks of a log, which decide whether the log can be trusted.
 
-    The report passes under three conditions. The log must be unchanged since it was written,
-    enough of its records (results of control periods) must have been compared, and every
-    repeated execution must agree with the log.
+    The report passes if the log is unchanged since it was written, enough of its records have
+    been compared, and every re-execution agrees with the log.
 
     Attributes:
         log: The checked log.
-        result: Result of executing the sites (arm controllers) of the log again.
-        findings: One finding for each check, in the order in which they are shown.
+        result: Result of re-executing the sites of the log.
+        findings: One finding per check, in display order.
     """
 
     log: Log
@@ -57,25 +56,16 @@ class LogCheckReport(CheckReport):
 
     @property
     def records(self) -> int:
-        """Number of records that were checked by executing their control periods again.
-
-        A record is the stored result of one control period.
-        """
+        """Number of records that were checked by re-executing their ticks."""
         return self.result.records
 
     @property
     def identical(self) -> int:
-        """Number of records whose control periods were executed again with the same bits.
-
-        Every field that a control period computes must agree.
-        """
+        """Number of records whose re-execution was bit-identical in every computed field."""
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the whole report on a log as plain values, ready for JSON.
-
-        The keys are those that `trilat verify --json` prints.
-        """
+        """Converts the report to plain JSON values, with the keys of `trilat verify --json`."""
         result = self.result
         first_difference = None
         if result.first is not None:
@@ -113,17 +103,16 @@ class LogCheckReport(CheckReport):
         min_coverage: float = MIN_COVERAGE,
         resume_every: int = 0,
     ) -> "LogCheckReport":
-        """Executes the control periods of a log again, and checks the log against the results.
+        """Re-executes the ticks of a log, and checks the log against the results.
 
         Args:
-            log: Log of a run or of a rerun that is to be checked.
+            log: Log of a run or rerun.
             virtual: If True, the log is also compared with a simulation of its scenario in
-                virtual time, as `compare_with_virtual` does.
-            progress: Function that is called now and then with the amount of work done and the
-                total. None if progress is not reported.
-            min_coverage: Smallest fraction of the ticks (control periods) of every site (arm
-                controller) that must be compared. A log with a smaller fraction fails even if
-                all compared records agree.
+                virtual time, see `compare_with_virtual`.
+            progress: Function that is called from time to time with the amount of work done and
+                the total. If None, progress is not reported.
+            min_coverage: Smallest fraction of every site's ticks that must be compared. A log
+                with a smaller fraction fails even if all compared records agree.
             resume_every: Interval, in ticks, at which a site is restored from the records, see
                 `verify_log`. 0 means never.
 
@@ -144,21 +133,20 @@ class LogCheckReport(CheckReport):
     def check_files(
         cls, sources: Sequence[str], min_coverage: float, allowed: CodeConsents
     ) -> list[Finding]:
-        """Checks one log, as a function that a worker process of a pool can run.
+        """Checks one log in a form that can run in a worker process of a pool.
 
-        Many logs can thus be checked in parallel: the arguments and the result can be sent to
-        another process. A user's control law that cannot be created gives a failed finding
-        instead of an error.
+        The arguments and the result can be sent to another process, so many logs can be checked
+        in parallel. A user's control law that cannot be created yields a failed finding instead
+        of an error.
 
         Args:
-            sources: Paths of the files that the log consists of.
-            min_coverage: Smallest fraction of the ticks (control periods) of every site that
-                must be compared.
+            sources: Paths of the files that make up the log.
+            min_coverage: Smallest fraction of every site's ticks that must be compared.
             allowed: Permissions to run users' code, in addition to the permissions of this
                 process.
 
         Returns:
-            One finding for each check.
+            One finding per check.
         """
         allowed_code.update(allowed)
         log = open_log(*sources)
@@ -169,7 +157,7 @@ class LogCheckReport(CheckReport):
 
 
 def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
-    """Returns a range of ticks as plain values."""
+    """Converts a range of ticks to plain values."""
     site, first, last = gap
     return {"site": site, "first": first, "last": last}
 
@@ -177,13 +165,13 @@ def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
 def _check_log(
     log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None
 ) -> Iterator[Finding]:
-    """Yields the finding of each check that applies to a log.
+    """Yields one finding for each check that applies to a log.
 
-    A finding says what was checked, what the result is, and whether the log passes.
+    A finding states what was checked, the result, and whether the log passes.
 
     Args:
         log: The log.
-        result: Result of executing the log again.
+        result: Result of re-executing the log.
         virtual: If True, the log is also compared with virtual time.
         progress: Function that reports the progress of this comparison.
     """
@@ -197,7 +185,7 @@ def _check_log(
 
     yield _check_coverage(log, result)
     yield Finding("integrity", result.integrity.text, result.integrity.passed)
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.inspect_user_laws():
         yield Finding("user law", str(law), law.allowed, law.allowed)
     yield _check_execution(result, recorded)
     if log.scenario.external:
@@ -209,7 +197,7 @@ def _check_log(
         )
     if log.session.get("scenario_sha256") != log.scenario_sha256:
         yield Finding(
-            "scenario", "does not have the hash that the log states: it was changed", False
+            "scenario", "does not have the hash stated in the log: it was changed", False
         )
 
     if not virtual:
@@ -219,12 +207,14 @@ def _check_log(
         yield Finding("virtual time", f"not compared: {reason}", False, judged=False)
     elif recorded:
         yield Finding(
-            "virtual time", f"is another run: {recorded} as recorded, and did not react", True
+            "virtual time",
+            f"is a different run: {recorded} as recorded, and did not react",
+            True,
         )
     elif log.absences:
         sites = " and ".join(log.absences)
         yield Finding(
-            "virtual time", f"is another run: {sites} left, or came while it ran", True
+            "virtual time", f"is a different run: {sites} left or joined during the run", True
         )
     else:
         yield from _check_virtual_time(log, result, progress)
@@ -235,20 +225,20 @@ def _check_virtual_time(
 ) -> Iterator[Finding]:
     """Yields the findings of the comparison of a log with two simulations of its scenario.
 
-    The simulations run in virtual time, without real clocks and without a network. They differ
-    in how a sample, the state that one site sends to another, arrives:
+    The simulations run in virtual time, without real clocks or a network. They differ in how
+    samples arrive:
 
     - "virtual time fed with the log's arrivals": each sample arrives when it did in the log.
-      All records must be equal, up to the first gap of the log.
+      All records must be equal, up to the first gap in the log.
     - "plain virtual time": each sample arrives at once. The records must be equal up to the
-      first sample that the real network delivered too late or lost. This simulation is left out
-      if the run differs from it by its nature, for example because an arm was external. This is
+      first sample that the real network lost or delivered too late. This simulation is omitted
+      if the run necessarily differs from it, for example because an arm was external. This is
       not a fault of the log, so the finding passes.
 
     Args:
         log: The log.
-        result: Result of executing the log again.
-        progress: Function that reports the progress of the comparison. None if progress is not
+        result: Result of re-executing the log.
+        progress: Function that reports the progress of the comparison. If None, progress is not
             reported.
     """
     comparison = compare_with_virtual(log, progress)
@@ -264,7 +254,7 @@ def _check_virtual_time(
         reason = "a link was measured, not modelled"
     if reason and log.driver != "virtual":
         passed = True
-        yield Finding("plain virtual time", f"is another run: {reason}", passed)
+        yield Finding("plain virtual time", f"is a different run: {reason}", passed)
         return
 
     late_samples = comparison.late
@@ -282,12 +272,11 @@ def _check_virtual_time(
 def _check_coverage(log: Log, result: VerifyResult) -> Finding:
     """Returns the finding about records that are missing from the log.
 
-    The log fails if too small a fraction of the ticks (control periods) of a site (arm
-    controller) could be compared.
+    The log fails if too small a fraction of the ticks of any site could be compared.
 
     Args:
         log: The log.
-        result: Result of executing the log again.
+        result: Result of re-executing the log.
     """
     coverage = result.coverage
     if coverage.expected:
@@ -315,17 +304,16 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
 
 
 def _check_execution(result: VerifyResult, recorded: str) -> Finding:
-    """Returns the finding that says whether executing the log again gave the same records.
+    """Returns the finding on whether re-executing the log gave the same records.
 
-    A record is the stored result of one tick, a period of the control loop of a site. The text
-    of the finding begins with the number of identical records. Every circumstance that limits
+    The text of the finding begins with the number of identical records. Everything that limits
     the comparison is appended: missing records, ticks that a site did not execute because it
-    had left the session, sites that were not executed again, records that could not be judged,
-    and differences.
+    had left the session, sites that were not re-executed, records that could not be judged, and
+    differences.
 
     Args:
-        result: Result of executing the log again.
-        recorded: Subject and verb of a sentence on sites whose records were copied, such as
+        result: Result of re-executing the log.
+        recorded: Subject and verb of a sentence about sites whose records were copied, such as
             "m1 stands". Empty if all sites were executed.
     """
     withheld = ""
@@ -366,22 +354,22 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
 
 
 def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Finding:
-    """Adds advice about user-defined control laws with hidden state to a finding.
+    """Adds advice to a finding about user-defined control laws that may have hidden state.
 
-    A law may store something outside of the records (results of control periods), such as an
-    attribute of its object. If an entire run is executed again, it repeats this hidden state,
-    so that all records agree. Only a site (arm controller) that is restored from its records
-    lacks the hidden state. The advised command tests this.
+    A law may store something outside the records, such as an attribute of its object. If an
+    entire run is re-executed, the hidden state is reproduced, so all records agree. Only a site
+    that is restored from its records lacks the hidden state. The recommended command tests
+    this.
 
     Args:
         finding: Finding of a check.
         log: Log of the run.
-        result: Result of executing the log again, without restoring sites from records.
+        result: Result of re-executing the log, without restoring sites from records.
 
     Returns:
-        The finding, with the advice if it says that whole runs of users' laws agree.
+        The finding, with the advice if it states that whole runs of users' laws agree.
     """
-    files = list(dict.fromkeys(str(law.file) for law in find_user_laws(log.scenario)))
+    files = list(dict.fromkeys(str(law.file) for law in log.scenario.inspect_user_laws()))
     have_runs_agreed = finding.check == "executed again" and finding.passed and result.whole_run
     if not files or not have_runs_agreed or result.withheld:
         return finding
@@ -397,19 +385,18 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
 
 
 def _join_names(names: Sequence[str]) -> str:
-    """Returns the names of sites as a list for a sentence, such as "m1, m2 and s"."""
+    """Joins the names of sites for use in a sentence, such as "m1, m2 and s"."""
     *before, last = names
     return f"{', '.join(before)} and {last}" if before else last
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of missing control periods (ticks) of each site as text.
+    """Lists the ranges of missing ticks of each site, such as "m1 3-7, 12; s 5".
 
-    An example is "m1 3-7, 12; s 5". At most `_MAX_GAPS_NAMED` ranges are listed. Further ones
-    are counted.
+    At most `_MAX_GAPS_NAMED` ranges are listed. The rest are only counted.
 
     Args:
-        gaps: Site (arm controller), first tick (control period) and last tick of each range.
+        gaps: Site, first tick and last tick of each range.
     """
     texts = []
     remaining = _MAX_GAPS_NAMED

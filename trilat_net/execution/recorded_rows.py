@@ -1,8 +1,8 @@
 """Converts the records of a log to arrays, so that compiled code can verify them quickly.
 
-A record is the stored result of one control period (tick) of an arm. To verify a log, each tick
-is computed again. The compiled loop `TickRepeater` does so for many consecutive ticks in one
-call, if all inputs of these ticks are in the log. `verify` executes the other ticks one by one.
+A log is verified by computing each tick again. The compiled loop `TickRepeater` does so for
+many consecutive ticks in one call, provided all inputs of these ticks are in the log. `verify`
+executes the other ticks one by one.
 
 Invariant:
     - Only records in the exact layout that this program writes are converted.
@@ -20,25 +20,23 @@ from ..log import IndexedRecords, Log, SiteLog
 from ..records import NS_PER_S
 
 BLOCK_ROWS = 1 << 14
-"""Largest number of records that are executed again together."""
+"""Maximum number of records that are re-executed together."""
 LEAST_ROWS = 8
-"""Smallest number of records for which the compiled loop is faster than single ticks."""
+"""Minimum number of records for which the compiled loop is faster than single ticks."""
 _FIRST_TARGET = 3
 """First column of the target in the field `hand`, after grip, number and source."""
 _MASK_64 = (1 << 64) - 1
 
 
 class SampleTable(NamedTuple):
-    """States that all sites of a log sent (samples), for a fast look-up by site and tick.
-
-    A site is the controller of one arm, and a tick one of its control periods.
+    """Samples sent by all sites of a log, for fast look-up by site and tick.
 
     Attributes:
-        bits: Position, velocity and external torque of each sample in the coordinates that
-            the sites (arm controllers) share, as the bits of the numbers, shape (N, 3 m).
-        rows: Row in `bits` of the sample of each site and tick (control period), shape (sites,
-            ticks). -1 if the log has no record of the tick.
-        sites: Index of each site in `rows`.
+        bits: Position, velocity and external torque of each sample in the coordinates that the
+            sites share, stored as the bit patterns of the floats, shape (N, 3 m).
+        rows: Row in `bits` of the sample of each site and tick, shape (sites, ticks). -1 if the
+            log has no record of the tick.
+        sites: Mapping from site to its index in `rows`.
     """
 
     bits: IntArray
@@ -47,17 +45,15 @@ class SampleTable(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log) -> "SampleTable | None":
-        """Collects the states (samples) that all sites of a log sent, for the compiled loop.
+        """Collects the samples that all sites of a log sent, for use by the compiled loop.
 
-        The loop executes a site (arm controller) again, and looks up the content of each sample
-        that arrived.
+        When the loop re-executes a site, it looks up the content of each sample that arrived.
 
         Args:
             log: The log.
 
         Returns:
-            The samples. None if a record (result of a control period) of the log does not have
-            the exact layout.
+            The samples, or None if a record of the log does not have the exact layout.
         """
         bits = []
         last_tick = max(site_log.last_tick for site_log in log.values())
@@ -84,10 +80,9 @@ def _find_samples(
     counts: IntArray, entries: IntArray, peers: IntArray, rows: IntArray, arrivals: IntArray,
     is_complete: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Determines the ticks for which the log contains the content of all arrived samples.
+    """Determines the ticks for which the log contains the content of all samples received.
 
-    A sample is the state that another site (arm controller), a peer, sent. The record of a tick
-    (control period) lists only the senders of the samples and the ticks in which they were
+    The record of a tick only lists the senders of the samples and the ticks in which they were
     sent.
 
     Args:
@@ -95,9 +90,10 @@ def _find_samples(
         entries: Peer, tick and latency of all N arrivals, shape (N, 3).
         peers: Index of each peer in `rows`.
         rows: Rows of samples, see `SampleTable`.
-        arrivals: Receives peer, tick and row of each arrival, shape (N, 3). The row is -1 if
-            the log does not contain the sample.
-        is_complete: Set to False for records with such arrivals, or with too many of them.
+        arrivals: Output array for peer, tick and row of each arrival, shape (N, 3). The row is
+            -1 if the log does not contain the sample.
+        is_complete: Output array. Set to False for records with such arrivals, or with too many
+            arrivals.
     """
     n = 0
     for k in range(counts.shape[0]):
@@ -118,17 +114,16 @@ def _find_samples(
 
 
 class PlainRows:
-    """Reads records of one site in blocks whose ticks compiled code can execute again.
+    """Reads the records of one site in blocks that compiled code can re-execute.
 
-    Only ordinary (plain) records are read: those for which all inputs of the tick (control
-    period) are in the log.
+    Only plain records are read, meaning that all inputs of the tick are in the log.
 
     Args:
-        site_log: Records of the site (arm controller).
+        site_log: Records of the site.
         indexed: The same records with the positions of their values.
         samples: Samples of all sites.
         resume_every: Interval, in ticks, at which the site is restored from its records. The
-            record there does not count as plain. 0 means never.
+            record at such a tick does not count as plain. 0 means never.
     """
 
     def __init__(
@@ -138,7 +133,7 @@ class PlainRows:
         samples: SampleTable,
         resume_every: int = 0,
     ) -> None:
-        """Stores the records of a site. Received messages are looked up on first use."""
+        """Stores the records of a site. Received samples are looked up on first use."""
         self._site_log = site_log
         self._indexed = indexed
         self._samples = samples
@@ -150,19 +145,18 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the random number in a record that tells two starts of a process apart."""
+        """Returns the boot in a record (the random number that identifies a process start)."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
-        """Counts the records that compiled code can execute next in one block.
+        """Counts the records that compiled code can execute next in a single block.
 
-        The caller makes sure that the first record is from the present start of the site's
-        process, and is the record of the next tick (control period). A block has at most
-        `BLOCK_ROWS` records (results of control periods).
+        The caller ensures that the first record comes from the current start of the site's
+        process and belongs to the next tick. A block has at most `BLOCK_ROWS` records.
 
         Args:
             row: Index of the first record.
-            before_tick: Tick before which the records end. None if there is no such limit.
+            before_tick: Tick before which the records end. If None, there is no such limit.
         """
         # `_stops` has the indices of the records that are not plain. The block ends before the
         # next of these records.
@@ -180,10 +174,9 @@ class PlainRows:
         return max(0, stop - row)
 
     def _is_first_of_run(self, row: int) -> bool:
-        """True if a record is complete although it does not follow the record before it.
+        """Returns True if a record is complete but does not follow the previous record.
 
-        Compiled code can execute a series of recorded control periods that starts at such a
-        record.
+        Compiled code can execute a series of recorded ticks that begins with such a record.
         """
         return bool(self._is_complete[row])
 
@@ -191,8 +184,8 @@ class PlainRows:
     def _stops(self) -> IntArray:
         """Indices of all records before which compiled code must stop, in ascending order.
 
-        Such a record lacks an input of its control period, or does not follow the record before
-        it. Slower code then continues.
+        Such a record lacks an input of its tick, or does not follow the previous record. Slower
+        code then takes over.
         """
         follows = np.zeros(len(self._site_log), np.bool_)
         ticks = self._site_log.tick
@@ -201,7 +194,7 @@ class PlainRows:
 
     @cached_property
     def _is_complete(self) -> NDArray[np.bool_]:
-        """For each record, whether all inputs of its tick are in the log, shape (K,)."""
+        """For each record, True if all inputs of its tick are in the log, shape (K,)."""
         ticks = self._site_log.tick
         nominal_times_ns = ticks * NS_PER_S // self._site_log.rate_hz
         # The compiled loop applies no changes of settings, and computes the nominal times.
@@ -228,17 +221,18 @@ class PlainRows:
     def _memory(self) -> tuple[IntArray, IntArray]:
         """Internal states of the control law and its site in all records (their field `mem`).
 
-        The first array has the index of the first number of each record in the second array,
-        and the total length, shape (K + 1,). The second array has the bits of the numbers.
+        The first array contains the index of each record's first element in the second array,
+        followed by the total length, shape (K + 1,). The second array contains the bit patterns
+        of the elements.
         """
         counts, bits = self._indexed.memory_words
         return _sum_before(counts), bits
 
     def read_rows(self, first: int, count: int) -> RecordedRows:
-        """Reads consecutive records as arrays, to execute their ticks in compiled code.
+        """Reads consecutive records as arrays, so that compiled code can execute their ticks.
 
         Args:
-            first: Index of the first record (result of a control period).
+            first: Index of the first record.
             count: Number of records, all of which must be plain (see `PlainRows`).
         """
         last = first + count
@@ -260,16 +254,16 @@ class PlainRows:
         )
 
     def repeat(self, repeater: TickRepeater, first: int, count: int, *, external: bool) -> int:
-        """Executes the control periods of records again in compiled code, to verify them.
+        """Re-executes the ticks of records in compiled code, to verify them.
 
         Args:
-            repeater: Executes the ticks (control periods) of the site (arm controller).
+            repeater: Executes the ticks of the site.
             first: Index of the first record.
             count: Number of records, all of which must be plain (see `PlainRows`).
             external: True if the motion of the arm was measured, as with a real robot.
 
         Returns:
-            The number of records before the first record that differs from its execution.
+            The number of records before the first one that differs from its re-execution.
         """
         rows = self.read_rows(first, count)
         if external:
@@ -279,7 +273,7 @@ class PlainRows:
 
 
 def _sum_before(counts: IntArray) -> IntArray:
-    """Returns where each of K lists begins if all lists are stored one after another.
+    """Returns where each of K lists begins if all lists are concatenated.
 
     For the lengths [2, 0, 3], the result is [0, 2, 2, 5]. The last entry is the total length.
     """
@@ -287,7 +281,7 @@ def _sum_before(counts: IntArray) -> IntArray:
 
 
 def _read_hands(block: IndexedRecords) -> Array:
-    """Returns the actions of a live operator, a person or program that moved the arm.
+    """Returns the actions of a live operator (a person or program that moved the arm).
 
     For m target coordinates, the shape is (K, 1 + 2 m): firmness of the grip, target, and the
     position that the target would reach after one second.

@@ -1,21 +1,18 @@
-"""Executes arms of a log again with changed settings, and rejects changes without effect.
+"""Re-executes arms of a log with changed settings, and rejects changes that have no effect.
 
-A log has one record per control period (tick) for each arm. `what_if` uses this module to
-compute some or all arms again, for example with another gain at the slave. A setting that
-concerns only arms that are not executed is rejected, because it would have no effect. A setting
-that concerns both kinds of arms changes only the executed ones, and the result reports this.
-
-Below, a site is the control process of an arm, and a sample is the state that a site sends to
-the others in each tick.
+A log has one record per tick for each arm. `what_if` uses this module to compute some or all
+arms again, for example with a different gain at the slave. A setting that affects only arms
+that are not executed is rejected, because it would have no effect. A setting that affects both
+kinds of arms changes only the executed ones, and the result reports this.
 
 Invariant:
-    - A site advances only by `Site.step`.
+    - A site advances only through `Site.step`.
     - A site receives the recorded samples of sites that are not executed, and the new samples
       of executed sites. Each sample arrives in the tick in which it arrived according to the
       log.
-    - Without changed settings, no tick is executed whose inputs are unknown because records are
-      missing. After a gap, the execution resumes as soon as two consecutive records exist. The
-      recorded result is used for a tick that has a record, but cannot be executed.
+    - Without changed settings, a tick is not executed if its inputs are unknown because records
+      are missing. After a gap, execution resumes as soon as two consecutive records exist. If a
+      tick has a record but cannot be executed, the recorded result is used.
     - With changed settings, ticks without a record are executed too. The arrivals of samples in
       these ticks are estimated.
 """
@@ -54,19 +51,19 @@ from .verification import (
 from .virtual_network import Deliveries
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
-"""Changed settings, either by key or as texts "KEY=VALUE"."""
+"""Changed settings: a mapping from key to value, or strings of the form "KEY=VALUE"."""
 
 _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
-"""Keys of a scenario that describe it and have no effect on a run."""
+"""Keys that describe a scenario and have no effect on a run."""
 
 
 class _ChangedValue(NamedTuple):
-    """One setting, such as a gain, that differs between a recorded run and its repetition.
+    """One setting, such as a gain, that differs between a recorded run and its rerun.
 
     Attributes:
-        key: Dotted path of the value in the resolved scenario, for example of a gain.
+        key: Dotted path of the setting in the resolved scenario.
         before: Value with which the log was recorded.
-        after: Value that the rerun uses.
+        after: Value used in the rerun.
     """
 
     key: str
@@ -78,17 +75,17 @@ class _ChangedValue(NamedTuple):
 class RerunRequest:
     """A checked request for a rerun: which sites of a log to execute again, and how.
 
-    `RerunRequest.resolve` creates it. The sites (arm controllers) that are not executed keep
-    the records (results of control periods) of the log.
+    Created by `RerunRequest.resolve`. Sites that are not executed keep the records of the log.
 
     Attributes:
         original: Scenario of the log.
         scenario: Scenario of the rerun. It contains the changes for the executed sites; the
-            recorded sites are as in the log.
-        replaced: Names of the executed sites, in the order of the scenario.
-        recorded: Names of the other sites, in the order of the scenario.
+            recorded sites are the same as in the log.
+        replaced: Names of the executed sites, in scenario order.
+        recorded: Names of the other sites, in scenario order.
         changes: Changed values.
-        without_effect: Requested changes that concern recorded sites, and have no effect.
+        without_effect: Requested changes that affect only recorded sites, and therefore have no
+            effect.
     """
 
     original: Scenario
@@ -100,21 +97,18 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """Kind of the repeated run: "closed loop" if every site is executed, else "open loop".
+        """Kind of the rerun: "closed loop" if every site is executed, otherwise "open loop".
 
-        In an open loop, sites (arm controllers) that are not executed keep their records, so
-        that they do not react to changes.
+        In an open loop, the sites that are not executed keep their records, and therefore do
+        not react to changes.
         """
         return "open loop" if self.recorded else "closed loop"
 
     def describe_changes(self) -> list[str]:
-        """Describes which settings the rerun changes, in lines for the user.
+        """Describes the settings that the rerun changes, with one line per kind of change.
 
-        If several sites (arm controllers) or links are changed in the same way, they share a
-        line.
-
-        Returns:
-            One line for each kind of change. Empty if nothing is changed.
+        Sites or links that are changed in the same way share a line. Empty if nothing is
+        changed.
         """
         owners: dict[tuple[str, str], list[str]] = {}
         for subject, owner, change in _describe_changes(self):
@@ -139,17 +133,17 @@ class RerunRequest:
         """Checks a request for a rerun, and applies its changes to the scenario of the log.
 
         A rerun executes sites of a log again, usually with changed settings. In a closed loop,
-        all sites are executed. Otherwise the sites that are not executed keep their records.
+        all sites are executed. Otherwise, the sites that are not executed keep their records.
 
         Args:
             log: Log of a run, which contains its scenario.
-            replace: Names of the sites to execute. Empty in a closed loop.
-            overrides: Changed settings, in the form that `load_scenario` accepts.
+            replace: Names of the sites to execute. Empty for a closed loop.
+            overrides: Changed settings, in the form accepted by `load_scenario`.
             closed_loop: If True, all sites are executed.
 
         Raises:
             UsageError: The sites are not named, or are named in two ways.
-            ScenarioError: There is no such site, or a change is not valid or cannot have an
+            ScenarioError: There is no such site, or a change is invalid or cannot have an
                 effect.
         """
         original = log.scenario
@@ -190,12 +184,13 @@ class RerunRequest:
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
-    """Rejects the repetition of a site whose arm is a real robot or a user's program.
+    """Raises ScenarioError if the arm of a site to be re-executed is external.
 
-    The log does not show how such an arm would have reacted to other torques.
+    The log does not show how a real robot or a user's program would have reacted to different
+    torques.
 
     Raises:
-        ScenarioError: A site that is to be executed again has such an arm.
+        ScenarioError: A site that is to be re-executed has such an arm.
     """
     for name in original.external:
         if name not in replaced:
@@ -212,9 +207,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
     """Rejects a changed setting that cannot have an effect in a rerun.
 
-    A rerun executes some sites (arm controllers) of a log again, and copies the records
-    (results of control periods) of the others. For example, a setting of a site whose records
-    are copied has no effect.
+    For example, a setting of a site whose records are copied has no effect.
 
     Args:
         key: Dotted path of the setting, such as "sites.m1.control.Kd".
@@ -250,10 +243,10 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 def _check_recorded_limits(
     original: Scenario, requested: Scenario, recorded: Sequence[str]
 ) -> None:
-    """Rejects changes of a rerun that the recorded arrivals of samples do not cover.
+    """Rejects changes to a rerun that are not covered by the recorded arrivals of samples.
 
-    Such changes are other sites (arm controllers), a longer duration, and other tick rates if
-    some sites are not executed.
+    These are different sites, a longer duration, and different tick rates if some sites are not
+    executed.
 
     Args:
         original: Scenario of the log.
@@ -287,16 +280,14 @@ def _join_scenarios(
 ) -> Scenario:
     """Returns the requested scenario, but with the original settings of the recorded sites.
 
-    A rerun executes some sites (arm controllers) of a log again with the requested settings.
-    The recorded sites are not executed and keep their settings. These include the links over
-    which they receive, and the planned changes of these links and of their dominance factors
-    (how strongly a site follows each other site).
+    The executed sites use the requested settings. The recorded sites keep their own settings,
+    which include the links over which they receive, and the planned changes of these links and
+    of their dominance factors.
 
     Args:
         original: Scenario of the log.
         requested: Scenario with the changes.
-        recorded: Names of the sites that are not executed, and keep their records (results of
-            control periods).
+        recorded: Names of the sites that are not executed, and keep their records.
     """
 
     def choose(site: str) -> Scenario:
@@ -319,7 +310,7 @@ def _join_scenarios(
 
 
 def _find_changes(original: Scenario, other: Scenario) -> list[_ChangedValue]:
-    """Returns the settings that differ between two scenarios, with both values of each."""
+    """Returns the settings that differ between two scenarios, with both of their values."""
     before = dict(flatten_table(msgspec.to_builtins(original)))
     after = dict(flatten_table(msgspec.to_builtins(other)))
     return [
@@ -333,9 +324,9 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
     """Yields the parts of a description for every change.
 
     The keys of changed values have the form group.owner.key, for example "sites.m1.control.Kd",
-    "links.m1->s.delay_ms" or "dominance.s.m1". Keys without an owner, such as "duration_s",
-    concern the whole scenario. If another link model or control law replaces that of the log,
-    several values of the same owner differ. They are described together, once.
+    "links.m1->s.delay_ms" or "dominance.s.m1". Keys with no owner, such as "duration_s", apply
+    to the whole scenario. If a link model or control law is replaced, several values of the
+    same owner differ. They are described once, together.
 
     Yields:
         The subject ("link" or the name of a key), its owner (a link or site, or empty for the
@@ -368,12 +359,12 @@ def _describe_replacement(
     Args:
         request: The request.
         group: First part of the changed key, for example "links".
-        owner: Second part of the key: a link or a site (arm controller).
+        owner: Second part of the key: a link or a site.
         key: Rest of the key.
 
     Returns:
-        Subject, owner and text, see `_describe_changes`. None if the change concerns a single
-        value.
+        Subject, owner and text, see `_describe_changes`. None if only a single value is
+        changed.
     """
     original = request.original
     changed = request.scenario
@@ -395,26 +386,25 @@ def _describe_replacement(
 
 
 def _shorten(value: object) -> str:
-    """Returns a value as a string. A list of tables is represented by its length only."""
+    """Formats a value as a string. For a list of tables, only its length is stated."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return f"{len(value)} {'entry' if len(value) == 1 else 'entries'}"
     return describe_value(value)
 
 
 class RerunTick(NamedTuple):
-    """One tick of a site that is executed again, with the record that it produced.
-
-    A tick is one period of the control loop, and its record is the stored result.
+    """One re-executed tick of a site, with the record that it produced.
 
     Attributes:
-        site: Name of the site (arm controller).
+        site: Name of the site.
         tick: Number of the tick.
         t_ns: Nominal time of the tick, in ns after the epoch (the common start time).
         mode: Operating mode in which the site executed the tick, for example running or at
             rest.
-        payload: Encoded record, as the site would publish it. If `kept`, the record of the log.
-        same: True if the log contains a record of the tick, and all computed fields have the
-            same bits.
+        payload: Encoded record, as the site would publish it. If `kept`, the record from the
+            log.
+        same: True if the log contains a record of the tick, and all computed fields are
+            bit-identical.
         kept: True if the record was copied, because the log does not contain enough to execute
             the tick.
         stats: Statistics of the site's links. None if they are not due in this tick.
@@ -431,26 +421,25 @@ class RerunTick(NamedTuple):
 
 
 class _RerunSite:
-    """Executes one site (arm controller) of a log again, tick (control period) by tick.
+    """Re-executes one site of a log, tick by tick.
 
-    The state of the site is certain if it follows from the ticks before. It becomes uncertain
-    after a gap in the log. Then records are copied until two consecutive records determine the
+    The state of the site is certain if it follows from the previous ticks. It becomes uncertain
+    after a gap in the log. Records are then copied until two consecutive records determine the
     state again.
 
     Args:
         log: The log.
         request: Executed sites and changed settings of the rerun.
         name: Name of the site.
-        deliveries: The ticks in which samples of other sites arrive at this one.
-        samples: Samples of all sites, by site and tick. A sample is the state that a site
-            publishes in one tick. The samples of executed sites appear in it while they are
-            computed.
+        deliveries: The ticks in which samples from other sites arrive at this one.
+        samples: Samples of all sites, keyed by site and tick. The samples of executed sites are
+            added as they are computed.
 
     Attributes:
         name: Name of the site.
         k: Number of the next tick.
         output: Record of the last tick.
-        deliveries: The ticks in which samples of other sites arrive at this one.
+        deliveries: The ticks in which samples from other sites arrive at this one.
         first: First difference from the records of the log. None if no record differs so far.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         diverged: True after the arm of the site has left its limits.
@@ -466,11 +455,7 @@ class _RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        """Creates a site in its initial state, and collects its recorded inputs from the log.
-
-        A site is the controller of one arm. A rerun repeats a recorded run with something
-        changed.
-        """
+        """Creates a site in its initial state, and collects its inputs from the log."""
         site_log = log[name]
         scenario = request.scenario
         setup = scenario.setup(name)
@@ -506,31 +491,28 @@ class _RerunSite:
 
     @property
     def is_done(self) -> bool:
-        """True if the site has executed its last control period, so that nothing is left."""
+        """True if the site has executed its last tick."""
         return self.diverged or self.k > self._last_tick
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the control period that is executed next, in ns after the epoch.
-
-        The epoch is the common start time of the sites (arm controllers).
-        """
+        """Nominal time of the next tick to execute, in ns after the epoch (common start)."""
         return self.k * NS_PER_S // self._site.rate_hz
 
     def execute_tick(self) -> RerunTick:
-        """Executes the next tick of the site (arm controller).
+        """Executes the next tick of the site, or copies its record if execution is impossible.
 
-        A tick is a period of the control loop. It can be executed only if the state of the site
-        before it is known (certain). There are three cases:
+        A tick can be executed only if the state of the site before it is certain. There are
+        three cases:
 
         - The state follows from the previous tick: the tick is executed.
-        - The state is uncertain, for example after a gap of the log, but the two records before
-          the tick determine it: the state is restored, and the tick is executed.
-        - The state stays uncertain: the record of the tick is copied from the log.
+        - The state is uncertain, for example after a gap in the log, but is determined by the
+          two records before the tick: the state is restored, and the tick is executed.
+        - The state remains uncertain: the record of the tick is copied from the log.
 
-        Afterwards, `k` is the next tick. In a gap, which has no records to copy and to compare,
-        ticks are executed only if settings were changed, because then the result is new there
-        too. Otherwise the gap is skipped.
+        Afterwards, `k` is the next tick. A gap contains no records to copy or compare, so its
+        ticks are executed only if settings were changed, in which case their results are new.
+        Otherwise the gap is skipped.
 
         Returns:
             The tick with its record.
@@ -561,9 +543,9 @@ class _RerunSite:
         return tick
 
     def _skip_gap(self) -> None:
-        """Continues at the next record of an incomplete log, without the unknown ticks before.
+        """Continues at the next record of an incomplete log, skipping the ticks before it.
 
-        If there is no further record, the site (arm controller) is done.
+        If there are no more records, the site is done.
         """
         index = bisect.bisect_right(self._recorded_ticks, self.k)
         self.k = self._last_tick + 1
@@ -572,10 +554,10 @@ class _RerunSite:
         self._certain = False
 
     def _execute(self, row: int | None) -> RerunTick:
-        """Executes the next tick (control period), and compares it with the record of the log.
+        """Executes the next tick, and compares it with the record in the log.
 
-        The inputs of the tick are the samples that arrive according to `deliveries`, and the
-        changes and the operator's actions in the log.
+        The inputs of the tick are the samples that arrive according to `deliveries`, together
+        with the changes and the operator's actions in the log.
 
         Args:
             row: Index of the record. None if the log does not contain a record of the tick.
@@ -634,7 +616,7 @@ class _RerunSite:
     def _keep_record(self, row: int) -> RerunTick:
         """Copies the record of the next tick from the log, because it cannot be executed.
 
-        The state of the site (arm controller) is not known afterwards.
+        The state of the site is unknown afterwards.
 
         Args:
             row: Index of the record in the log.
@@ -664,24 +646,24 @@ No sample is in transit for longer.
 class RerunExecution:
     """Executes all requested sites of a log again, together.
 
-    A site is the control process of an arm. The executed sites exchange the samples (states)
-    that they compute now. The samples of the other sites are those of the log.
+    The executed sites exchange newly computed samples. The samples of the other sites are taken
+    from the log.
 
     Args:
         log: The log.
         request: Executed sites and changed settings of the rerun.
 
     Attributes:
-        sites: The executed sites, by name.
+        sites: Mapping from name to executed site.
 
     Raises:
         LogError: The log does not contain enough to execute the sites.
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
-        """Creates the sites that are executed again, and connects them with each other.
+        """Creates the sites that are re-executed, and connects them to each other.
 
-        A site (arm controller) then receives what the others compute, not what was recorded.
+        They receive what the other sites compute now, not what was recorded.
         """
         self._log = log
         self._request = request
@@ -703,14 +685,12 @@ class RerunExecution:
         }
 
     def _find_deliveries(self, name: str) -> Deliveries:
-        """Determines in which tick of a site each sample of the other sites arrives.
+        """Determines in which tick of a site each sample from the other sites arrives.
 
-        A sample is the state that a site (arm controller) sends in one tick, a period of its
-        control loop. There are three cases:
+        There are three cases:
 
-        - No setting was changed: the samples arrive as the records (results of control periods)
-          of the site list them.
-        - Settings were changed: arrivals in ticks without a record are assumed.
+        - No setting was changed: the samples arrive as listed in the records of the site.
+        - Settings were changed: arrivals in ticks without a record are estimated.
         - Tick rates were changed: in addition, all arrivals are converted to the new rates.
 
         Raises:
@@ -746,14 +726,13 @@ class RerunExecution:
     def run(self, progress: Progress | None = None) -> Iterator[RerunTick]:
         """Executes all ticks of the requested sites, and yields the result of each tick.
 
-        A site is a simulated process that runs one arm, and a tick is a period of its control
-        loop. Ticks are executed in order of time, but a site waits until the data that it
-        receives exists. A site stops when its arm leaves its limits. If settings were changed,
+        Ticks are executed in order of time, except that a site waits until the samples that it
+        receives exist. A site stops when its arm leaves its limits. If settings were changed,
         all sites stop at this time.
 
         Args:
-            progress: Function that is called now and then with the number of executed ticks,
-                and an upper bound on their total. None if progress is not reported.
+            progress: Function that is called from time to time with the number of executed
+                ticks, and an upper bound on their total. If None, progress is not reported.
 
         Yields:
             The result of each tick.
@@ -782,9 +761,9 @@ class RerunExecution:
                 progress(executed, total)
 
     def _keep_sample(self, site: _RerunSite) -> None:
-        """Stores the newest state of an executed site, which its peers will receive.
+        """Stores the newest sample of an executed site, which its peers will receive.
 
-        States that are too old to arrive are removed.
+        Samples that are too old to arrive are removed.
         """
         output = site.output
         recent = self._recent[site.name]
@@ -793,13 +772,12 @@ class RerunExecution:
             del recent[next(iter(recent))]
 
     def _find_ready(self, pending: Sequence[tuple[int, int, int]]) -> int:
-        """Chooses the site that executes its next tick, by its index in a list.
+        """Chooses the site that executes its next tick.
 
-        A tick (control period) can be executed once all samples that arrive in it are known.
-        The earliest such tick is chosen. If no tick is ready, because each site (arm
-        controller) waits for a sample of another site, the earliest tick is chosen
-        nevertheless, because the execution must continue. The missing samples then count as not
-        contained in the log.
+        A tick can be executed once all samples that arrive in it are known. The earliest such
+        tick is chosen. If no tick is ready because every site is waiting for a sample from
+        another site, the earliest tick is chosen anyway, since the execution must continue. The
+        missing samples are then treated as not contained in the log.
 
         Args:
             pending: Next tick of each executed site that has not finished, as (time in ns,
@@ -815,14 +793,14 @@ class RerunExecution:
         return 0  # the earliest
 
     def _is_ready(self, receiver: str, k: int) -> bool:
-        """True if a site does not have to wait for samples that arrive in its next tick.
+        """Returns True if all samples that arrive in a site's next tick are known.
 
-        A sample is the state that a sender publishes in one tick (control period). It is ready
-        if the sender has executed this tick, or has finished and never will. The samples of a
-        sender that is not executed in this rerun are in the log, so they are always ready.
+        A sample is ready if the sender has executed the tick that produces it, or has finished
+        and never will. The samples of a sender that is not executed are in the log, so they are
+        always ready.
 
         Args:
-            receiver: Name of the site (arm controller).
+            receiver: Name of the site.
             k: Number of its next tick.
         """
         sender_names = self._log[receiver].peers

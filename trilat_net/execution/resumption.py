@@ -1,15 +1,15 @@
 """Restores the state of an arm in the middle of a log, to execute the rest of the run.
 
-A log has a record for each control period (tick), with the state of the arm and with the
-samples (states of other arms) that arrived. If records are missing, the ticks of this gap
-cannot be executed again. After the gap, the execution resumes from a restored state.
+A log has one record per tick, which contains the state of the arm and lists the samples that
+arrived from other arms. If records are missing, the ticks of this gap cannot be executed again.
+After the gap, execution resumes from a restored state.
 
 Invariant (L3):
-    - Two consecutive records, and the samples that the arm has received but not used yet,
-      suffice to restore the state of the arm and its controller.
-    - If records are missing, it is not known which samples arrived in these ticks. A sample
-      that was sent, but is missing from all records of the receiver, is assumed to have arrived
-      in such a tick.
+    - The state of the arm and its controller can be restored from two consecutive records,
+      together with the samples that the arm has received but not used yet.
+    - If records are missing, it is unknown which samples arrived in those ticks. A sample that
+      was sent, but appears in none of the receiver's records, is assumed to have arrived in
+      such a tick.
 """
 
 from bisect import bisect_left
@@ -25,27 +25,25 @@ from ..net import RESTING_MODES, State
 from ..records import NS_PER_S, Arrival, TickRecord
 
 _LOOK_BACK = 100
-"""Number of records before a gap that are searched for the newest arrived sample."""
+"""Number of records before a gap that are searched for the newest sample received."""
 
 Change = TypeVar("Change")
 
 ArrivalEntry = Sequence[int]
-"""Arrival in the form of a record's `rx`: index of the peer, tick of its sample, latency in us.
-"""
+"""Arrival in the format of a record's `rx`: peer index, tick of the sample, latency in us."""
 
 
 ReceivedMotion = State | Arrival
-"""Sample of a peer: a record of the log, or a newly computed arrival."""
+"""Sample from a peer: a record in the log, or a newly computed arrival."""
 
 
 def make_arrival(
     peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0
 ) -> Arrival:
-    """Returns the message with which a sample of another site arrives at a receiver.
+    """Returns the message with which a sample from another site arrives at a receiver.
 
-    A sample is the state that a site (arm controller) publishes in one tick (control period).
-    The message contains all numbers that the control law of the sender sends, for all
-    receivers. `select_peer_channels` selects the numbers for one receiver.
+    The message contains all values that the sender's control law sends, for all receivers. Use
+    `select_peer_channels` to select the values for one receiver.
 
     Args:
         peer: Index of the sender among the sites from which the receiver gets samples.
@@ -75,15 +73,14 @@ def make_arrival(
 def select_peer_channels(
     arrivals: Sequence[Arrival], links: Sequence[LinkSetup]
 ) -> list[Arrival]:
-    """Returns copies of arrivals that contain only what one receiver gets.
+    """Returns copies of arrivals that contain only the values intended for one receiver.
 
-    A control law may send different numbers to different receivers. The numbers for other
+    A control law may send different values to different receivers. The values for other
     receivers are removed.
 
     Args:
-        arrivals: Arrivals with the numbers for all receivers.
-        links: Links of the receiver, in the order of its peers. A peer is a site (arm
-            controller) from which it gets samples (sent states).
+        arrivals: Arrivals with the values for all receivers.
+        links: Links of the receiver, one per peer and in the same order.
     """
     selected = []
     for arrival in arrivals:
@@ -99,15 +96,13 @@ def select_peer_channels(
 def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
     """Returns how an operator moved a site's arm in one tick, according to the log.
 
-    The operator is a person or program that moves the arm. A site is a process that runs one
-    arm, and a tick is a period of its control loop. The site is executed again, possibly with
-    another number of ticks per second. Therefore the newest record (result of a control period)
-    up to the time of the tick is used.
+    The re-executed site may have a different tick rate, so the newest record up to the time of
+    the tick is used.
 
     Args:
         site_log: Records of the site in the log.
-        site: The site that is executed again.
-        k: Number of the tick of the executed site.
+        site: The re-executed site.
+        k: Number of the tick of the re-executed site.
 
     Returns:
         The operator's grip, target and velocity, in the order of `HandInForce`. Empty if the
@@ -126,22 +121,21 @@ def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
 class RecordedInputs(Generic[Change]):
     """All inputs of one site according to a log: received samples and changes of settings.
 
-    With these inputs, the site (arm controller) can be executed again. A sample is the state
-    that another site (a peer) published in one tick (control period).
+    With these inputs, the site can be executed again.
 
     Args:
         site_log: Records of the site.
-        samples: Records or arrivals of all sites, by site and tick.
+        samples: Records or arrivals of all sites, keyed by site and tick.
         ends: Last tick of each site.
-        changes: Changes that took effect at the site, by tick.
+        changes: Changes that took effect at the site, keyed by tick.
         links: Links over which the site receives, in the order of its peers.
         states: Records of the site, if they differ from the decoded records of `site_log`.
 
     Attributes:
-        samples: Samples of each peer, by the tick in which the peer published them.
+        samples: Samples of each peer, keyed by the tick in which the peer published them.
         ends: Last tick of each peer.
         assumed: For each peer, the ticks of samples that are assumed to have arrived in a gap
-            of the log.
+            in the log.
         lacking: For each peer, the ticks of samples that arrived, but whose content is missing
             from the log.
     """
@@ -155,10 +149,7 @@ class RecordedInputs(Generic[Change]):
         links: Sequence[LinkSetup],
         states: Sequence[State] | None = None,
     ) -> None:
-        """Collects what a site received in a recorded run, before its first control period.
-
-        These are the samples (states that other sites sent) and the changes of settings.
-        """
+        """Collects what a site received in a recorded run: samples and changes of settings."""
         self._site_log = site_log
         self._states = site_log.states if states is None else states
         self._links = links
@@ -170,21 +161,21 @@ class RecordedInputs(Generic[Change]):
 
     @property
     def next_change_tick(self) -> int | None:
-        """Control period (tick) at which the next change of the settings takes effect.
+        """Tick at which the next change of the settings takes effect.
 
-        None if there are no further changes in the recorded run.
+        None if the recorded run has no further changes.
         """
         return self._changes[-1][0] if self._changes else None
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Removes and returns the changes of settings that take effect up to a control period.
+        """Removes and returns the changes of settings that take effect no later than a tick.
 
         Args:
             tick: Last tick whose changes are returned.
 
         Returns:
-            Pairs of the tick of a change and the change, in order of time. Empty if there are
-            no further changes.
+            Pairs of (tick, change), in ascending order of tick. Empty if there are no further
+            changes.
         """
         popped: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
@@ -195,13 +186,13 @@ class RecordedInputs(Generic[Change]):
     def find_arrivals(
         self, entries: Sequence[ArrivalEntry]
     ) -> tuple[list[Arrival], list[ArrivalEntry]]:
-        """Looks up the content of samples that arrived in a tick (control period).
+        """Looks up the content of the samples that arrived in a tick.
 
-        The record of a tick lists only which samples (sent states) arrived. Their content is in
-        the records of the senders.
+        The record of a tick only lists which samples arrived. Their content is in the records
+        of the senders.
 
         Args:
-            entries: Arrived samples, in the form of the field `rx` of a record.
+            entries: Arrived samples, in the format of the field `rx` of a record.
 
         Returns:
             The arrivals with the content of their samples, and the entries whose content is
@@ -222,9 +213,8 @@ class RecordedInputs(Generic[Change]):
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
         """Stores which samples arrived although the log does not contain their content.
 
-        A sample is the state that another site (arm controller) sent. Its content is unknown if
-        the record of the sender is missing. A tick (control period) that uses the sample cannot
-        be computed with certainty.
+        The content is unknown if the sender's record is missing. A tick that uses such a sample
+        cannot be computed with certainty.
 
         Args:
             entries: The samples: index of the sender, number of the tick in which it sent the
@@ -234,22 +224,21 @@ class RecordedInputs(Generic[Change]):
             self.lacking[peer].add(tick)
 
     def can_resume(self, row: int, *, detached: bool = False) -> bool:
-        """True if the log contains enough to restore a site's state before a given record.
+        """Returns True if the log contains enough to restore a site's state before a record.
 
-        A site is a process that runs one arm, and a record contains the results of one tick
-        (period of its control loop). There are two conditions:
+        There are two conditions:
 
-        - The records of the two ticks before must exist. The second record contains the state
-          of the arm and of the control law. The first record contains a control torque that is
-          part of the state of the control loop.
-        - The log must contain the samples (states of other sites) that the site used in the
-          last tick, because it may use them again. This does not matter for a site that rests
-          at a position of its own, because such a site ignores the samples.
+        - The records of the two preceding ticks must exist. The later one contains the state of
+          the arm and of the control law; the earlier one contains a control torque that is part
+          of the state of the control loop.
+        - The log must contain the samples from other sites that the site used in the last tick,
+          because it may use them again. A site that rests at a position of its own ignores
+          samples, and is exempt from this condition.
 
         Args:
             row: Index of the record, among the records of the site.
-            detached: True if the site, while it is at rest, holds a position of its own instead
-                of following other sites.
+            detached: True if the site, while at rest, holds a position of its own instead of
+                following other sites.
         """
         states = self._states
         if row < 2:
@@ -270,15 +259,13 @@ class RecordedInputs(Generic[Change]):
         return True
 
     def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
-        """Restores the state that a site had at a given point of a log, after missing records.
+        """Restores the state that a site had at a given point in a log, after missing records.
 
-        A site is a process that runs one arm, and a record contains the results of one tick
-        (period of its control loop). The state before a tick is restored from the records of
-        the two ticks before it. `can_resume` states whether these records and all other
-        required data exist.
+        The state before a tick is restored from the records of the two preceding ticks. Call
+        `can_resume` first to check that these records and all other required data exist.
 
         Args:
-            site: The site, executed again. Its state is replaced.
+            site: The re-executed site, whose state is replaced.
             row: Index of the record of the next tick, among the records of the site.
             changes: Changes of settings since the last executed tick of the site.
         """
@@ -312,12 +299,11 @@ class RecordedInputs(Generic[Change]):
         site.restore_state(before_last, last)
 
     def _find_in_use(self, peer: int, used_tick: int, coordinates: int) -> Arrival | None:
-        """Returns the sample of a peer that the site used in its last tick before a gap.
+        """Returns the sample from a peer that the site used in its last tick before a gap.
 
-        A sample is the state that a peer, another site (arm controller), sent in one of its
-        ticks (control periods). If the log does not contain it, a sample of zeros takes its
-        place. This happens only for a site that holds a position of its own and therefore does
-        not use the sample, see `can_resume`. The sample is remembered in `lacking`.
+        If the log does not contain the sample, it is replaced by a sample of zeros and listed
+        in `lacking`. This happens only for a site that holds a position of its own and
+        therefore does not use the sample, see `can_resume`.
 
         Args:
             peer: Index of the peer.
@@ -325,7 +311,7 @@ class RecordedInputs(Generic[Change]):
             coordinates: Number of coordinates of the sample.
 
         Returns:
-            The sample. None before the first sample.
+            The sample, or None before the first sample.
         """
         sample = self.samples[peer].get(used_tick)
         if sample is None:
@@ -339,16 +325,15 @@ class RecordedInputs(Generic[Change]):
         return arrival_for_site
 
     def is_uncertain(self, state: State, output: TickRecord) -> bool:
-        """True if a difference of a record may be due to missing data of the log.
+        """Returns True if a deviation from a record may be due to data missing from the log.
 
-        In each tick (control period), a site (arm controller) uses the newest sample (state) of
-        each other site, its peers. The tick is uncertain if the arrival of such a sample was
-        assumed, because no record lists it, or if the content of the sample is missing from the
-        log.
+        In each tick, a site uses the newest sample from each of its peers. The tick is
+        uncertain if the arrival of such a sample was assumed, because no record lists it, or if
+        the content of the sample is missing from the log.
 
         Args:
             state: Record of the tick in the log.
-            output: Result of executing the same tick again.
+            output: Result of re-executing the tick.
         """
         for peer, peer_name in enumerate(self._site_log.peers):
             # Ticks of the used samples. -1 before the first sample.
@@ -365,11 +350,10 @@ class RecordedInputs(Generic[Change]):
     def _find_waiting(
         self, row: int, peer: int, used_tick: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Finds received states that were still delayed by a link at the time of a record.
+        """Finds received samples that were still delayed by a link at the time of a record.
 
-        A sample, the state that a peer (another site) sends, waits at the receiver until the
-        delay of the link has passed. If records are missing from the log, it is not certain
-        which samples had arrived.
+        A sample waits at the receiver until the delay of the link has passed. If records are
+        missing from the log, it is uncertain which samples had arrived.
 
         Args:
             row: Index of the record, among the records of the receiver.
@@ -380,8 +364,8 @@ class RecordedInputs(Generic[Change]):
 
         Returns:
             Ticks of the samples that certainly arrived, because an earlier record lists them,
-            and ticks of samples that probably arrived. The second kind is in no record, and is
-            older than the given record or than the first sample that a later record lists.
+            and ticks of samples that probably arrived. The latter are in no record, and are
+            older than the given record or than the first sample listed in a later record.
         """
         states = self._states
         t_ns = states[row].t_ns
@@ -412,13 +396,9 @@ class RecordedInputs(Generic[Change]):
         return certain_ticks, probable_ticks
 
     def _find_newest_listed(self, row: int, peer: int) -> int:
-        """Returns the newest state of a peer that the latest records of a site list.
+        """Returns the tick of the newest sample from a peer in the latest records of a site.
 
-        The site has received this state. A peer is another site (arm controller).
-
-        Returns:
-            Tick of the sample. -1 if these records (results of control periods) list no sample
-            of the peer.
+        -1 if these records list no sample from the peer.
         """
         newest = -1
         for state in self._states[max(0, row - _LOOK_BACK) : row]:
@@ -429,11 +409,11 @@ class RecordedInputs(Generic[Change]):
 
     @cached_property
     def _listings(self) -> "list[_PeerListing]":
-        """Index of the records that list samples from each peer (site that sends samples).
+        """Index of the records that list samples from each peer.
 
-        The record of a tick (control period) lists the samples (sent states) that arrived in
-        this tick. The index answers two questions quickly: in which record is a sample listed
-        first, and which sample does the next record after a gap list.
+        The record of a tick lists the samples that arrived in this tick. The index makes it
+        fast to find the first record that lists a given sample, and the sample listed by the
+        next record after a gap.
         """
         listings = [_PeerListing(first_rows={}, rows=[], first_ticks=[]) for _ in self.samples]
         for row, state in enumerate(self._states):
@@ -452,14 +432,12 @@ class RecordedInputs(Generic[Change]):
 
 
 class _PeerListing(NamedTuple):
-    """Index of the records of a site that list received states of one peer.
-
-    A peer is another site (arm controller).
+    """Index of the records of a site that list samples received from one peer.
 
     Attributes:
-        first_rows: For the tick (control period) of each sample, the row of the first record
-            that lists it.
-        rows: Rows of all records that list a sample of the peer, in ascending order.
+        first_rows: Mapping from the tick of each sample to the row of the first record that
+            lists it.
+        rows: Rows of all records that list a sample from the peer, in ascending order.
         first_ticks: For each of these rows, the tick of the first sample that the record lists.
     """
 

@@ -1,19 +1,19 @@
 """Shows whether a run is stable, by repeating it with small disturbances.
 
 A repetition is called a twin, and its disturbance a push: a small displacement of the state at
-one time. If the distance between the twin and the run grows, the run is unstable.
+one instant. If the distance between the twin and the run grows, the run is unstable.
 
-A distance that has become large is scaled down again (Benettin, Galgani, Giorgilli and
-Strelcyn, Meccanica 15, 1980). Let x be a number of the twin's state, which includes the samples
-in transit on the network, and x_run the same number in the run. Then x is replaced by x_run +
-factor (x - x_run), with the same factor for all numbers. The sum of the logarithms of all
-factors gives the total growth. If the distance has decayed to rounding errors, the twin is
-pushed again.
+When the distance becomes large, it is scaled down again (Benettin, Galgani, Giorgilli and
+Strelcyn, Meccanica 15, 1980). Let x be a component of the twin's state, which includes the
+samples in transit on the network, and x_run the same component in the run. Then x is replaced
+by x_run + factor (x - x_run), with the same factor for all components. The sum of the
+logarithms of all factors gives the total growth. If the distance has decayed to rounding
+errors, the twin is pushed again.
 
 Invariant:
-    - The run is executed again from its recorded inputs, and compared with its records.
-    - A twin receives the same arrivals, changes, actions of operators and random delays as the
-      run. Therefore the difference is the effect of the push alone.
+    - The run is re-executed from its recorded inputs, and compared with its records.
+    - A twin receives the same arrivals, changes, operator actions and random delays as the run,
+      so any difference is caused by the push alone.
     - The difference is computed from two complete nonlinear runs, not from a linear model.
 """
 
@@ -33,37 +33,33 @@ from ..scenario import Scenario
 from .fused import FusedRun
 
 MAX_PUSHES = 32
-"""Largest number of pushes that are chosen if the user states no number."""
+"""Maximum number of pushes that are chosen if the user states no number."""
 PUSH_RAD = 1e-6
-"""Usual size of a push, in rad."""
+"""Default size of a push, in rad."""
 LARGEST = 1e-4
-"""Largest difference at the end of a window, in rad or rad/s.
+"""Maximum difference at the end of a window, in rad or rad/s.
 
 A larger difference is scaled down if it also exceeds ten times the size of the push.
 """
 SMALLEST = 1e-12
 """Difference below which rounding errors dominate, in rad/s."""
 WINDOWS = 16
-"""Number of windows of a run. Differences are scaled down or displaced again at their ends."""
+"""Number of windows in a run. At the end of each, differences are scaled down or renewed."""
 
 
 class Push(NamedTuple):
     """Small displacement of the state of a twin, for example by 1e-6 rad at one joint.
 
-    A twin is a second execution of the same run. Its difference from the run then shows whether
-    small disturbances grow or die away.
-
     Attributes:
         name: Description for the user, for example "1e-06 rad at m1 joint 1".
         field: Displaced part of the state: joint angles "q" in rad, joint velocities "qd" in
             rad/s, or estimated arm parameters "theta_hat".
-        by: Displacement of every number of this part, shape (N, n), with one row per site (arm
-            controller).
+        by: Displacement of every element of this part, shape (N, n), with one row per site.
         at_s: Time of the push, in s after the epoch (the common start time).
         again: If True, a twin whose difference has decayed to rounding errors is pushed again.
             Otherwise the twin ends.
         largest: Difference beyond which the twin is moved closer to the run, in the unit of the
-            field. Infinite if this is never done.
+            field. Infinite to disable this.
         direction: Number of the random direction in which all joints are pushed, from 1. 0 if
             the joints were chosen in another way.
     """
@@ -82,17 +78,16 @@ class Push(NamedTuple):
     ) -> "Push":
         """Converts a user's description of a push to a `Push` object.
 
-        A push is a small displacement of the state of a twin, which is a second execution of
-        the run. Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of
-        joint 2), "m2.theta3" (estimate 3) and "m1.q". Without a number, all joints or estimates
-        of the site are pushed in a random direction. Without a site, the joints or estimates of
+        Examples of descriptions are "m1.q1" (joint 1 of site m1), "s.qd2" (velocity of joint
+        2), "m2.theta3" (estimate 3) and "m1.q". Without an index, all joints or estimates of
+        the site are pushed in a random direction. Without a site, the joints or estimates of
         all sites are pushed.
 
         The twin is pushed only once. A push that is itself larger than `LARGEST` is never
         scaled down.
 
         Args:
-            scenario: Description of the experiment.
+            scenario: The scenario.
             target: Description of what is pushed, for example "m1.q1".
             size: Size of the push, in rad, rad/s, or the unit of an estimate.
             at_s: Time of the push, in s after the epoch (the common start time).
@@ -140,22 +135,21 @@ class Push(NamedTuple):
     def choose(cls, scenario: Scenario, count: int | None = None) -> "list[Push]":
         """Chooses pushes that together can reveal every kind of instability.
 
-        A push is a small displacement of the state of a twin, which is a second execution of
-        the run. Different pushes displace different joints or estimates:
+        Different pushes displace different joints or estimates:
 
-        - one push of all estimated parameters if the control law of a site (arm controller)
-          estimates any;
+        - one push of all estimated parameters, if the control law of any site estimates
+          parameters;
         - up to three pushes of all joints in a random direction, with sizes around `PUSH_RAD`.
-          The sizes differ, because growth may depend on the amplitude;
-        - one push of each joint, because a joint that does not act on the others shows its
-          growth clearly only if it is pushed itself.
+          The sizes differ because growth may depend on the amplitude;
+        - one push per joint, because growth at a joint that does not act on the others is
+          clearly visible only if that joint itself is pushed.
 
         If there are not enough pushes for all joints, the joints are not pushed one by one, but
         all together in several random directions.
 
         Args:
-            scenario: Description of the experiment.
-            count: Number of pushes. If None, each joint is pushed, in addition to the other
+            scenario: The scenario.
+            count: Number of pushes. If None, each joint is pushed in addition to the other
                 pushes above, up to `MAX_PUSHES` in total.
         """
         # The target of "m1 joint 1" is "m1.q1".
@@ -184,18 +178,17 @@ class Push(NamedTuple):
 class TwinPath(NamedTuple):
     """Distance between a twin and the run over time, in intervals of 50 ms.
 
-    A twin is a second execution of the run in which the state received a small push. If the
-    difference becomes large, it is scaled down, and if it has decayed, the twin is pushed
-    again. The run has K intervals, and all sites (arm controllers) together have J joints.
+    A large difference is scaled down, and a twin whose difference has decayed is pushed again.
+    The run has K intervals, and all sites together have J joints.
 
     Attributes:
         push: Push of the twin.
         t_s: Ends of the intervals, in s, shape (K,).
-        largest: Natural logarithm of the largest difference of velocity of each joint in each
+        largest: Natural logarithm of the largest velocity difference of each joint in each
             interval, in rad/s, shape (K, J). It is computed as if the difference had never been
             scaled down. -inf if the twin and the run are equal.
-        last: Difference of velocity in the last tick (control period) of each interval, in
-            rad/s, shape (K, J). It is the actual difference, which may have been scaled down.
+        last: Velocity difference in the last tick of each interval, in rad/s, shape (K, J).
+            This is the actual difference, which may have been scaled down.
         scale: Natural logarithm of the factor by which `last` must be multiplied to undo the
             scaling, shape (K,).
         pushed: Indices of the intervals in which the twin was pushed.
@@ -213,19 +206,18 @@ class TwinPath(NamedTuple):
 
 
 class Twins(NamedTuple):
-    """A run and slightly displaced copies of it, which show whether the run is stable.
+    """A run and slightly displaced copies of it (twins), which show whether the run is stable.
 
     A twin is a second execution of the run in which the state received a small push. The twins
-    show whether small disturbances grow or die away. `of_log` and `of_scenario` create the
-    object.
+    show whether small disturbances grow or die away. Use `of_log` or `of_scenario` to create
+    the object.
 
     Attributes:
         paths: Difference between each twin and the run, over time.
-        joints: Names of the joints of all sites (arm controllers), for example "m1 joint 1".
+        joints: Names of the joints of all sites, for example "m1 joint 1".
         speed: Largest speed of each joint of the run in each interval of 50 ms, in rad/s, shape
-            (K, J). The differences can be compared with it.
-        same: True if the repeated run has the same bits as the records (results of control
-            periods) of the log.
+            (K, J), for comparison with the differences.
+        same: True if the repeated run is bit-identical to the records of the log.
     """
 
     paths: Sequence[TwinPath]
@@ -235,19 +227,16 @@ class Twins(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> "Twins":
-        """Repeats the run of a log, together with a twin for every push.
-
-        A twin is a further execution of the run that receives a small push. The differences
-        between the twins and the run show whether small disturbances grow or die away.
+        """Repeats the run of a log, together with one twin per push.
 
         Args:
             log: Log of the run.
-            pushes: Small displacements of the state, one for each twin.
-            own_laws: True if control laws that are code of users may run.
+            pushes: Small displacements of the state, one per twin.
+            own_laws: True if control laws written by users may run.
 
         Raises:
             NotRepeatable: The run cannot be repeated, or the repeated run differs from the
-                records (results of control periods).
+                records.
             LogError: A record cannot be read.
         """
         reason = FusedRun.explain_not_repeatable(log, own_laws=own_laws)
@@ -267,16 +256,15 @@ class Twins(NamedTuple):
     ) -> "Twins":
         """Simulates an experiment, and repeats it with small pushes to see whether they grow.
 
-        A repetition with a push is called a twin. There is one twin for each push. The run and
-        its twins are simulated faster than real time.
+        The run and its twins (one per push) are simulated faster than real time.
 
         Args:
-            scenario: Description of the experiment.
-            pushes: Small displacements of the state of the arms, one for each twin.
+            scenario: The scenario.
+            pushes: Small displacements of the state of the arms, one per twin.
             duration_s: Duration of the run, in s.
 
         Returns:
-            The difference between each twin and the run, over time.
+            The run and its twins, with the difference of each twin over time.
 
         Raises:
             ScenarioError: The scenario cannot be simulated.
@@ -290,7 +278,7 @@ class Twins(NamedTuple):
 def _list_joints(scenario: Scenario) -> tuple[str, ...]:
     """Returns the names of the joints of all arms, for example "m1 joint 1" for the arm m1.
 
-    The names are in the order of the arms in the scenario, the description of the experiment.
+    The arms are in scenario order.
     """
     joints = []
     for name in scenario.names:
@@ -302,12 +290,12 @@ def _list_joints(scenario: Scenario) -> tuple[str, ...]:
 def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
     """Returns a small displacement of all joints in a random direction.
 
-    The displacement is applied to a copy of the run, to see whether the difference grows.
+    It is applied to a copy of the run, to see whether the difference grows.
 
     Args:
-        scenario: Description of the experiment.
-        number: Number of the direction, counted from 1. Different numbers have different
-            directions.
+        scenario: The scenario.
+        number: Number of the direction, counted from 1. Each number gives a different
+            direction.
     """
     push = Push.parse(scenario, "q")
     generator = np.random.Generator(np.random.Philox(number))
@@ -319,15 +307,15 @@ def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
 
 
 LEAST_PUSH = 1e-11
-"""Smallest size of a push. A smaller push would be lost in rounding errors."""
+"""Minimum size of a push. A smaller push would be lost in rounding errors."""
 MOST_PUSH = 1.0
-"""Largest size of a push. A larger push would not be a small disturbance."""
+"""Maximum size of a push. A larger push would not be a small disturbance."""
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
 """Matches the target of a push: optional site, kind, and optional number, counted from 1."""
 
 
 def _describe_target(site: str | None, kind: str, number: str | None) -> str:
-    """Returns the unit and target of a push as a string, for example "rad at m1 joint 1"."""
+    """Returns the unit and target of a push, for example "rad at m1 joint 1"."""
     noun = "estimate" if kind == "theta" else "joint"
     unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
     if number:
@@ -343,7 +331,7 @@ def _count_joints(scenario: Scenario) -> list[int]:
 
 
 def _count_estimates(scenario: Scenario) -> list[int]:
-    """Returns the number of estimated parameters of each site. 0 for laws that do not learn."""
+    """Returns the number of estimated parameters of each site, 0 for laws that do not learn."""
     counts = []
     for name in scenario.names:
         learns = scenario.gains(name).law is Law.ADAPTIVE
@@ -352,7 +340,7 @@ def _count_estimates(scenario: Scenario) -> list[int]:
 
 
 def _describe_targets(scenario: Scenario, target: str) -> str:
-    """Returns the error message for a wrong target, which lists the possible targets."""
+    """Returns the error message for an invalid target, which lists the valid ones."""
     descriptions = []
     for name, estimates in zip(scenario.names, _count_estimates(scenario), strict=True):
         joints = scenario.layout(name).joints
@@ -370,10 +358,9 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
 
 
 LANE_SITE_TICKS = 100_000_000
-"""Number of site ticks from which the code for twins side by side is compiled.
+"""Number of site ticks from which the code that runs twins side by side is worth compiling.
 
-The compilation takes about ten seconds. Code that has been compiled already is used for any
-number of ticks.
+Compilation takes about ten seconds. Once compiled, the code is used for any number of ticks.
 """
 
 
@@ -384,15 +371,15 @@ def _run_twins(
     inputs: RunInputs | None = None,
     log: Log | None = None,
 ) -> Twins:
-    """Executes a run and its twins, the copies that start slightly displaced.
+    """Executes a run and its twins (copies that start slightly displaced).
 
-    If possible, all of them are computed side by side with vector instructions (each in a
-    lane). Otherwise they are executed one after another, with the same results.
+    If possible, all of them are computed side by side with vector instructions (one per lane).
+    Otherwise they are executed one after another, with the same results.
 
     Args:
         scenario: The scenario.
         pushes: Push of each twin.
-        ticks: Number of ticks (control periods) of each site (arm controller).
+        ticks: Number of ticks of each site.
         inputs: Inputs of a recorded run that is repeated. None for a new run.
         log: Log of the recorded run, with which the repeated run is compared.
     """
@@ -410,14 +397,14 @@ def _run_twins(
 
 
 class _SiteVelocities(NamedTuple):
-    """Joint velocities of one arm in a part of a run, by intervals of 50 ms.
+    """Joint velocities of one arm over part of a run, divided into intervals of 50 ms.
 
     Attributes:
-        cells: Index by which an array with a row per interval and a column per joint of all
-            sites (arm controllers) returns the intervals and joints of this site.
-        starts: Index of the first tick (control period) of each interval.
-        qd: Velocities of the run, in rad/s, with a row per tick and a column per joint.
-        twin_qd: Velocities of the displaced copy of the run (twin), in the same form.
+        cells: Index that selects the intervals and joints of this site from an array with one
+            row per interval and one column per joint of all sites.
+        starts: Index of the first tick of each interval.
+        qd: Velocities of the run, in rad/s, with one row per tick and one column per joint.
+        twin_qd: Velocities of the displaced copy of the run (twin), in the same format.
     """
 
     cells: tuple[Ints, ...]
@@ -427,16 +414,16 @@ class _SiteVelocities(NamedTuple):
 
 
 class _TwinRuns:
-    """Executes a run together with its twins, the copies that are slightly displaced (pushed).
+    """Executes a run together with its twins (copies that are slightly displaced, or pushed).
 
-    The run is divided into windows of time. At the end of each window, the difference between a
+    The run is divided into time windows. At the end of each window, the difference between a
     twin and the run is scaled down if it has become large, and the twin is pushed again if the
     difference has decayed.
 
     Args:
         scenario: The scenario.
         pushes: Push of each twin.
-        ticks: Number of ticks (control periods) of each site (arm controller).
+        ticks: Number of ticks of each site.
         inputs: Inputs of a recorded run that is repeated. None for a new run.
         log: Log of the recorded run, with which the repeated run is compared.
     """
@@ -449,9 +436,9 @@ class _TwinRuns:
         inputs: RunInputs | None = None,
         log: Log | None = None,
     ) -> None:
-        """Creates a run and slightly displaced copies of it (twins), and empty results.
+        """Creates a run and slightly displaced copies of it (twins), with empty results.
 
-        No control period has been executed yet.
+        No tick is executed yet.
         """
         self._log = log
         self._pushes = pushes
@@ -489,11 +476,11 @@ class _TwinRuns:
         inputs: RunInputs | None,
         record_count: int,
     ) -> list[Any]:
-        """Creates a run and copies of it (twins), before their first control period.
+        """Creates a run and copies of it (twins), before their first tick.
 
         Args:
             scenario: The scenario.
-            ticks: Number of ticks of each site (arm controller).
+            ticks: Number of ticks of each site.
             inputs: Inputs of a recorded run that is repeated, or None.
             record_count: Number of records of each site that must be kept.
         """
@@ -506,7 +493,7 @@ class _TwinRuns:
     def run(self) -> Twins:
         """Simulates a run and slightly displaced copies of it, and returns their differences.
 
-        Differences that grow show that the system is unstable.
+        Growing differences show that the system is unstable.
         """
         for twin_index, push in enumerate(self._pushes):
             if push.at_s == 0.0:
@@ -534,8 +521,8 @@ class _TwinRuns:
     def _execute_window(self, end_s: float) -> None:
         """Continues a run and its displaced copies (twins), and measures their differences.
 
-        A twin that has not been displaced yet equals the run. Therefore it is not executed, but
-        copied from the run when its displacement is due.
+        A twin that has not been displaced yet is identical to the run. It is therefore not
+        executed, but copied from the run when its displacement is due.
 
         Args:
             end_s: End of the window, in s.
@@ -562,9 +549,9 @@ class _TwinRuns:
                 self._push(twin_index, end_s)
 
     def _push(self, twin_index: int, at_s: float) -> None:
-        """Displaces the state of a copy of the run (twin) slightly, and stores the time.
+        """Slightly displaces the state of a copy of the run (twin), and stores the time.
 
-        The later growth or decay of the difference shows whether the system is stable.
+        The subsequent growth or decay of the difference shows whether the system is stable.
 
         Args:
             twin_index: Index of the twin.
@@ -576,14 +563,14 @@ class _TwinRuns:
         self._scale[twin_index] = 0.0
 
     def _compare_with_log(self, log: Log, records: Sequence[tuple[Ints, Array]]) -> None:
-        """Checks that the repeated run equals its log, up to rounding errors.
+        """Raises NotRepeatable if the repeated run deviates from its log.
 
-        Otherwise the twins would not describe the run in the log.
+        Rounding errors are allowed. If the deviation is larger, the twins would not describe
+        the run in the log.
 
         Args:
             log: The log.
-            records: Times and records (results of control periods) of each site (arm
-                controller) since the last call.
+            records: Times and records of each site since the last call.
 
         Raises:
             NotRepeatable: A joint angle, velocity or torque differs.
@@ -613,11 +600,10 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> Iterator[_SiteVelocities]:
-        """Yields the joint velocities of each arm in a part of a run, by intervals of 50 ms.
+        """Yields the joint velocities of each arm over part of a run, in intervals of 50 ms.
 
         Args:
-            records: Times and records (results of control periods) of each site (arm
-                controller) of the run.
+            records: Times and records of each site of the run.
             twin_records: Times and records of each site of a twin.
         """
         first_joint = 0  # index of the site's first joint among the joints of all sites
@@ -644,16 +630,14 @@ class _TwinRuns:
         records: Sequence[tuple[Ints, Array]],
         twin_records: Sequence[tuple[Ints, Array]],
     ) -> None:
-        """Stores the difference between a twin and the run in one window of time.
+        """Stores the difference between a twin and the run in one time window.
 
-        A twin is a copy of the run that was slightly displaced. A window is a part of the run
-        after which the difference may be scaled down. The largest differences are stored as
-        logarithms, as if they had never been scaled down.
+        The difference may be scaled down at the end of a window. The largest differences are
+        stored as logarithms, as if they had never been scaled down.
 
         Args:
             twin_index: Index of the twin.
-            records: Times and records (results of control periods) of each site (arm
-                controller) of the run.
+            records: Times and records of each site of the run.
             twin_records: Times and records of each site of the twin.
         """
         for cells, starts, qd, twin_qd in self._split_buckets(records, twin_records):
@@ -668,11 +652,10 @@ class _TwinRuns:
             self._scales[twin_index, cells[0].reshape(-1)] = self._scale[twin_index]
 
     def _renew_difference(self, n: int, end_s: float) -> None:
-        """Keeps the difference between a twin and the run from becoming too large or small.
+        """Keeps the difference between a twin and the run from becoming too large or too small.
 
-        A twin is a second execution of the run that received a small push. A large difference
-        is scaled down to the size of the push, so that it stays small. A decayed difference
-        consists only of rounding errors. The twin is then pushed again, or ends.
+        A large difference is scaled down to the size of the push. A decayed difference consists
+        only of rounding errors; the twin is then pushed again, or ends.
 
         Args:
             n: Index of the twin.
@@ -702,13 +685,13 @@ class _TwinRuns:
             self._scale[n] -= math.log(factor)
 
     def _find_recent_peak(self, n: int, end_s: float) -> float:
-        """Returns the distance between a run and its displaced copy in the last second.
+        """Returns the distance between a run and its displaced copy (twin) in the last second.
 
-        The distance is the logarithm of the largest difference of velocities. Positions do not
-        show a decay, because the copy (twin) may come to rest at another position.
+        The distance is the logarithm of the largest velocity difference. Positions do not show
+        decay, because the twin may come to rest at a different position.
 
         Args:
-            n: Index of the twin, a displaced copy of the run.
+            n: Index of the twin.
             end_s: Present time, in s.
         """
         end_interval = round(end_s * BUCKETS_PER_S)
@@ -718,9 +701,7 @@ class _TwinRuns:
         return float(last_second.max(initial=-np.inf) - self._scale[n])
 
     def _end_path(self, n: int) -> None:
-        """Stores that the difference between a displaced copy (twin) and the run has decayed.
-
-        Only rounding errors are left of the difference.
+        """Stores that the difference between a twin and the run has decayed to rounding errors.
 
         Args:
             n: Index of the twin, a displaced copy of the run.
@@ -738,8 +719,8 @@ class _TwinRuns:
 class _LaneTwinRuns(_TwinRuns):
     """Executes a run and its twins side by side, with the same results as `_TwinRuns`.
 
-    A twin is a copy of the run that was slightly displaced. Each run occupies one lane, an
-    element of the vector registers, so that one instruction computes a number of several runs.
+    Each run occupies one lane (an element of the vector registers), so one instruction computes
+    a value for several runs.
     """
 
     def _make_runs(
@@ -749,7 +730,7 @@ class _LaneTwinRuns(_TwinRuns):
         inputs: RunInputs | None,
         record_count: int,
     ) -> list[Any]:
-        """Creates the run and its twins (displaced copies), each in a lane of the vectors."""
+        """Creates the run and its twins (displaced copies), each in one lane of the vectors."""
         from ..core import TwinLanes
 
         run = FusedRun(scenario, inputs=inputs)
@@ -789,7 +770,7 @@ class _LaneTwinRuns(_TwinRuns):
                 self._push(n, end_s)
 
     def _measure_window(self, measured: Sequence[int]) -> None:
-        """Stores the speeds of the run and the differences of the twins in a window of time.
+        """Stores the speeds of the run and the differences of the twins in a time window.
 
         Args:
             measured: Indices of the twins that are measured.
@@ -821,7 +802,7 @@ class _LaneTwinRuns(_TwinRuns):
 
 
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
-    """Returns the times at which the differences between runs are measured, in s, ascending.
+    """Returns the times at which differences between runs are measured, in s, ascending.
 
     They are the multiples of 50 ms, and the times at which copies of the run are displaced.
 
@@ -844,7 +825,7 @@ def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
 
 
 SAME_RUN = 1e-7
-"""Largest permitted difference of a repeated run from its records, in rad, rad/s or N m.
+"""Maximum difference between a repeated run and its records, in rad, rad/s or N m.
 
 Rounding errors differ if the log was recorded on another platform.
 """

@@ -1,10 +1,11 @@
-"""Simulates a run in compiled code, and keeps its records as a log that was never encoded.
+"""Simulates a run in compiled code, and keeps its records as a log that is never encoded.
 
-`SimulatedLog` executes each tick in Python and writes a message for it. A study that
-judges thousands of runs, and needs the records of some, uses `simulate_columns` instead.
+`SimulatedLog` executes each tick in Python and writes a message for it. `simulate_columns` is
+the faster alternative for studies that evaluate thousands of runs and need the records of some
+of them.
 
 Invariant:
-    - The columns have the same bits as those of the log that `SimulatedLog` returns.
+    - The columns are bit-identical to those of the log that `SimulatedLog` returns.
 """
 
 from typing import Any
@@ -19,19 +20,19 @@ from .fused import FusedRun
 from .virtual import SimulatedLog
 
 _BLOCK_TICKS = 4096
-"""Number of ticks of the fastest site after which the records are copied."""
+"""Interval at which the records are copied, in ticks of the fastest site."""
 
 
 def simulate_columns(scenario: Scenario) -> Log:
     """Simulates an experiment, and returns a log with the columns of its records.
 
-    The log has the columns that the simulation computes: times, modes, motions, torques,
-    estimates, sent values, and the samples in use. If these columns do not describe the run
-    completely (see `_is_described_by_columns`), or if the run ends early, the result is an
-    ordinary log.
+    The log contains the columns computed by the simulation: times, modes, motions, torques,
+    estimates, sent values, and the samples in use. An ordinary log is returned if these columns
+    do not describe the run completely (see `_is_described_by_columns`), or if the run ends
+    early.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
 
     Raises:
         ScenarioError: The scenario cannot run in virtual time.
@@ -64,13 +65,14 @@ def simulate_columns(scenario: Scenario) -> Log:
 
 
 def _is_described_by_columns(scenario: Scenario) -> bool:
-    """Returns True if arrays from the simulation describe a run completely, without a log.
+    """Returns True if the arrays computed by the simulation describe a run completely.
 
-    Only a written log contains changes of settings, the actions of live operators, the motions
-    of objects in an environment, and the modes of a site that reacts to missing samples.
+    Some information exists only in a written log: changes of settings, the actions of live
+    operators, the motion of objects in an environment, and the modes of a site that reacts to
+    missing samples.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     if scenario.timeline or any(link.outages_s for link in scenario.links.values()):
         return False

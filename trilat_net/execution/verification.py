@@ -1,17 +1,17 @@
-"""Verifies a log: executes every site again, and compares every computed field of every record.
+"""Verifies a log by re-executing every site and comparing every computed field of every record.
 
-A record is the logged result of one tick of a site's control loop. The inputs of the tick, such
-as the samples that arrived, are in the log as well. Therefore the tick can be computed again.
+This is possible because the log contains not only the result of each tick, but also its inputs,
+such as the samples that arrived.
 
 Invariant (L3, L5):
-    - `Site.step` gets its inputs only from the log, and its code from the program and from
-      files of users' control laws, whose hashes are in the log.
+    - The inputs of `Site.step` come only from the log, and its code comes from the program and
+      from files with users' control laws, whose hashes are in the log.
     - On the platform on which the log was recorded (equal fingerprint), whole runs are
-      executed, and must agree with the log bit for bit.
-    - On another platform, rounding differs. Each tick is then computed from the two records
-      before it, and two numbers a and b agree if |a - b| <= 1e-9 (1 + |a|).
-    - Gaps of the log are reported. After a gap, the execution resumes from two consecutive
-      records. Records that cannot be judged are counted, but never reported as differences.
+      executed, and must be bit-identical to the log.
+    - On other platforms, rounding differs. Each tick is then computed from the two preceding
+      records, and two values a and b agree if |a - b| <= 1e-9 (1 + |a|).
+    - Gaps in the log are reported. After a gap, execution resumes from two consecutive records.
+      Records that cannot be judged are counted, but never reported as differences.
 """
 
 from array import array
@@ -51,7 +51,6 @@ from ..log import (
     open_log,
 )
 from ..net import MODE_WORDS, STATE_VECTORS, State
-from ..own_code import find_user_laws
 from ..recorded_change import count_skipped_ticks
 from ..records import TickRecord
 from ..scenario import parse_core_change
@@ -59,32 +58,34 @@ from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable
 from .resumption import ArrivalEntry, RecordedInputs
 
 TOLERANCE = 1e-9
-"""Numbers a and b of different platforms count as equal if |a - b| <= TOLERANCE (1 + |a|)."""
+"""Numbers a and b from different platforms are considered equal if |a - b| <= TOLERANCE (1 +
+|a|).
+"""
 
 NumberEquality = Callable[[float, float], bool]
-"""Function that decides whether a logged and a computed number count as equal."""
+"""Function that decides whether a logged and a computed number are considered equal."""
 
 
 def _equal_bits(a: float, b: float) -> bool:
-    """True if two floating-point numbers are identical bit by bit.
+    """Returns True if two floating-point numbers are identical bit by bit.
 
-    Unlike `==`, this distinguishes -0.0 from 0.0, and counts two NaNs as equal.
+    Unlike `==`, this distinguishes -0.0 from 0.0, and treats two NaNs as equal.
     """
     return a.hex() == b.hex()
 
 
 class RecordDifference(NamedTuple):
-    """Difference between a record of a log and the result of executing the same tick again.
+    """Difference between a record of a log and the result of re-executing its tick.
 
-    Only the first field that differs is stated.
+    Only the first differing field is stored.
 
     Attributes:
-        site: Name of the site (arm controller) whose record it is.
-        tick: Number of the tick (control period).
-        field: Name of the field. For a vector, it includes the index of the number, for example
-            "q[1]".
+        site: Name of the site that produced the record.
+        tick: Number of the tick.
+        field: Name of the field. For a vector, the name includes the index of the element, for
+            example "q[1]".
         logged: Value in the log.
-        computed: Value of the repeated execution.
+        computed: Value computed by the re-execution.
     """
 
     site: str
@@ -94,7 +95,7 @@ class RecordDifference(NamedTuple):
     computed: Any
 
     def __str__(self) -> str:
-        """Returns a sentence about the difference, for the report to the user."""
+        """Describes the difference in one sentence, for the report to the user."""
         logged = _format_value(self.logged)
         computed = _format_value(self.computed)
         location = f"{self.site}, tick {self.tick}, {self.field}"
@@ -102,14 +103,14 @@ class RecordDifference(NamedTuple):
 
     @classmethod
     def of_law_failure(cls, failure: LawFailed) -> "RecordDifference":
-        """Describes a user's control law that fails when a log is executed again.
+        """Describes a user's control law that fails when a log is re-executed.
 
-        The law did not fail in the logged session. The site with the law (process that runs one
-        arm) cannot be executed further. The report counts the failure as a logged record
-        (result of a control period) that the new execution did not reproduce.
+        The law did not fail in the logged session. The site that uses the law cannot be
+        executed any further, and the report counts the failure as a logged record that the
+        re-execution did not reproduce.
 
         Args:
-            failure: The error of the control law.
+            failure: The error raised by the control law.
         """
         return cls(
             site=failure.site,
@@ -128,19 +129,19 @@ class RecordDifference(NamedTuple):
         equal: NumberEquality = _equal_bits,
         channel: LawChannel = LawChannel(),  # noqa: B008
     ) -> "RecordDifference | None":
-        """Finds the first field of a record that differs from a repeated control period.
+        """Finds the first field of a record that differs from a re-execution of its tick.
 
         Args:
-            logged: Record of a tick (control period), as the log contains it.
-            computed: Result of executing the same tick again.
-            peers: Names of the other sites (arm controllers), in the order of the scenario.
-            equal: Function that decides whether two numbers count as equal. By default, they
-                must have the same bits.
-            channel: Layout of the vectors that the site's control law sends, with their names.
-                By default, the law sends no vectors.
+            logged: Record of the tick in the log.
+            computed: Result of re-executing the tick.
+            peers: Names of the other sites, in scenario order.
+            equal: Function that decides whether two numbers are considered equal. By default,
+                they must be bit-identical.
+            channel: Layout and names of the vectors that the site's control law sends. By
+                default, the law sends no vectors.
 
         Returns:
-            The difference. None if all computed fields agree.
+            The difference, or None if all computed fields agree.
         """
         comparisons = _compare_fields(
             logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
@@ -158,14 +159,14 @@ class RecordDifference(NamedTuple):
 
 
 def _format_value(value: object) -> str:
-    """Returns a value as a string. The text of a floating-point number also shows its bits."""
+    """Formats a value as a string. For a floating-point number, its bits are shown too."""
     return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
 
 
 def _equal_to_tolerance(a: float, b: float) -> bool:
-    """True if two numbers agree within `TOLERANCE`.
+    """Returns True if two numbers agree within `TOLERANCE`.
 
-    Two platforms may round some operations differently. Results of the same computation on both
+    Two platforms may round some operations differently. The results of the same computation
     should still agree to this extent.
     """
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
@@ -175,21 +176,21 @@ _get_vectors = attrgetter(*STATE_VECTORS, "mem")
 
 
 def _pack_vectors(record: State | TickRecord) -> bytes:
-    """Returns the bytes of all vectors of a record, which can be compared at once."""
+    """Packs all vectors of a record into bytes, which can be compared in one step."""
     return array("d", chain.from_iterable(_get_vectors(record))).tobytes()
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
-    """True if a record has the same bits as the result of executing its tick again.
+    """Returns True if a record is bit-identical to the result of re-executing its tick.
 
     All computed fields are compared. Nearly all records are equal, so this function is
-    optimised for speed. If it returns False, `RecordDifference.find` finds the field that
-    differs.
+    optimised for speed. If it returns False, use `RecordDifference.find` to find the differing
+    field.
 
     Args:
-        logged: Record of a tick (control period), as the log contains it.
-        computed: Result of executing the same tick again.
-        peers: Names of the other sites (arm controllers), in the order of the scenario.
+        logged: Record of the tick in the log.
+        computed: Result of re-executing the tick.
+        peers: Names of the other sites, in scenario order.
     """
     return (
         _pack_vectors(logged) == _pack_vectors(computed)
@@ -209,7 +210,7 @@ def _compare_fields(
     equal: NumberEquality,
     channel: LawChannel,
 ) -> Iterator[tuple[str, Any, Any, bool]]:
-    """Compares a recorded control period with its repeated execution, field by field.
+    """Compares a recorded tick with its re-execution, field by field.
 
     See `RecordDifference.find`.
 
@@ -253,28 +254,27 @@ def _compare_fields(
 
 @dataclass(slots=True)
 class VerifyResult:
-    """Result of executing the sites (arm controllers) of a log again, to check the log.
+    """Result of checking a log by re-executing its sites.
 
-    A record is the stored result of one tick (control period). It is judged by comparing it
-    with the result of executing the tick again. A record after a gap of the log may be
-    impossible to judge.
+    Each record is judged by comparing it with the result of re-executing its tick. It may be
+    impossible to judge a record after a gap in the log.
 
     Attributes:
-        whole_run: True if whole runs were executed, and bits were compared. False if single
-            ticks were executed, and numbers were compared within a tolerance.
+        whole_run: True if whole runs were executed and compared bit by bit. False if single
+            ticks were executed and compared within a tolerance.
         coverage: For each site, the number of judged ticks and the number of ticks of the run.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         integrity: States whether the log is unchanged since it was written.
         records: Number of records that were examined.
-        identical: Number of records in which every computed field agrees with the execution.
+        identical: Number of records in which every computed field agrees with the re-execution.
         unjudged: Number of records after gaps that could not be judged.
-        differing: Number of records that differ from the execution.
+        differing: Number of records that differ from the re-execution.
         first: Difference in the earliest tick. None if there is no difference.
         gaps: Ranges of missing ticks, as (site, first tick, last tick).
         absences: Ranges of ticks that a site did not execute because it had left the session,
             as (site, first tick, last tick).
         withheld: Names of the sites that were not executed, because their control law is code
-            that may not run. They are not included in the other numbers.
+            that may not run. They are excluded from all other results.
     """
 
     whole_run: bool
@@ -292,9 +292,9 @@ class VerifyResult:
 
     @property
     def agreed(self) -> bool:
-        """True if no record of the log differs from a repeated execution of its control period.
+        """True if no record of the log differs from the re-execution of its tick.
 
-        The result is also True if few records or no records could be compared.
+        Also True if few or no records could be compared.
         """
         return self.first is None
 
@@ -302,24 +302,23 @@ class VerifyResult:
     def passed(self) -> bool:
         """True if the log can be trusted to contain what the controllers computed.
 
-        No record differs from the repeated execution, the log is unchanged since it was
-        written, and enough of the control periods of every site were compared.
+        This requires that no record differs from its re-execution, that the log is unchanged
+        since it was written, and that enough ticks of every site were compared.
         """
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
-        """Adds the result for further sites of the same log to this result.
+        """Merges the result for other sites of the same log into this result.
 
-        A site is a process that runs one arm. The log of a rerun (repeated execution of a log)
-        contains some sites that were copied from an older log. They are checked with that log,
-        which gives a separate result.
+        The log of a rerun contains some sites that were copied from an older log. These sites
+        are checked against that log, which gives a separate result.
 
-        Numbers are added, and lists are joined. The sum counts as a whole run, or as intact,
-        only if both results do.
+        Counts are added, and lists are concatenated. The merged result covers whole runs, or is
+        intact, only if this holds for both results.
 
         Args:
-            other: Result for the further sites. It does not change.
+            other: Result for the other sites. It is not modified.
         """
         self.records += other.records
         self.identical += other.identical
@@ -339,47 +338,46 @@ class VerifyResult:
             self.integrity = other.integrity  # one failed log suffices to fail the whole check
 
     def add_difference(self, difference: RecordDifference) -> None:
-        """Counts one more record that differs from the repetition of its control period.
+        """Counts one more record that differs from the re-execution of its tick.
 
         Args:
-            difference: The difference. It is stored as `first` if it is the earliest
-                difference.
+            difference: The difference. It is stored as `first` if it is the earliest one.
         """
         self.differing += 1
         self._keep_first(difference)
 
     def _keep_first(self, difference: RecordDifference | None) -> None:
-        """Stores a difference as `first`, if it is in the earliest tick so far."""
+        """Stores a difference as `first` if its tick is the earliest so far."""
         if difference is not None and (self.first is None or difference.tick < self.first.tick):
             self.first = difference
 
 
 PROGRESS_EVERY = 256
-"""Number of records between two reports of progress."""
+"""Number of records between two progress reports."""
 _MOST_SINGLE_RECORDS = 1 << 12
-"""Largest number of records that are examined one by one before the compiled loop is tried."""
+"""Maximum number of records examined one by one before the compiled loop is tried."""
 
 
 class _SiteVerifier:
-    """Executes one site again from its records, and compares each record with the result.
+    """Re-executes one site from its records, and compares each record with the result.
 
-    The state of the executed site (arm controller) is certain as long as it follows from the
-    records before. It becomes uncertain at a gap of the log, and if the site uses a sample that
-    the log does not contain. Two consecutive records make it certain again.
+    The state of the executed site is certain as long as it follows from the previous records.
+    It becomes uncertain at a gap in the log, and if the site uses a sample that the log does
+    not contain. Two consecutive records make it certain again.
 
-    The log does not say which samples arrived during a gap. A sample that no record lists is
-    assumed to have arrived during the gap. While a sample with an assumed arrival is in use, a
-    record that differs does not count as different, but as impossible to judge. The same
-    applies to a sample that arrived, but whose content is missing from the log.
+    The log does not show which samples arrived during a gap. A sample that no record lists is
+    assumed to have arrived during the gap. While such a sample is in use, a deviating record is
+    counted as impossible to judge rather than as different. The same applies to a sample that
+    arrived, but whose content is missing from the log.
 
-    Most records are plain: their state is certain, and all of their inputs are in the log. A
-    compiled loop executes their ticks (control periods). It ends before the first record that
-    differs. This record is then examined like every record that is not plain, by `Site.step`.
+    Most records are plain: their state is certain, and all of their inputs are in the log.
+    Their ticks are executed by a compiled loop, which stops before the first record that
+    differs. That record, and every record that is not plain, is examined with `Site.step`.
 
     Args:
         log: The log.
         site: Name of the site.
-        samples: Samples of all sites for the compiled loop. None if it cannot be used.
+        samples: Samples of all sites for the compiled loop. None if the loop cannot be used.
         result: Object to which the counts and differences are added.
         resume_every: Interval, in ticks, at which the site is restored from the records, see
             `verify_log`. 0 means never.
@@ -438,16 +436,15 @@ class _SiteVerifier:
         )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
-        """Executes every recorded tick of a site again, and compares the results with the log.
+        """Re-executes every recorded tick of a site, and compares the results with the log.
 
-        A site is a process that runs one arm, and a tick is a period of its control loop. Long
-        sequences of ordinary records (results of control periods) are executed by a compiled
-        loop, and the other records one by one. The numbers of equal, different and missing
-        records are added to the `VerifyResult` of this object.
+        Long sequences of ordinary records are executed by a compiled loop, and all others one
+        by one. The counts of identical, differing and missing records are added to the
+        `VerifyResult` of this object.
 
         Args:
-            report: Function that is called now and then with the number of examined records of
-                all sites. None if progress is not reported.
+            report: Function that is called from time to time with the number of examined
+                records of all sites. If None, progress is not reported.
         """
         result = self._result
         name = self._log.name
@@ -478,18 +475,18 @@ class _SiteVerifier:
             result.gaps.append((name, next_tick, self._last_tick))
 
     def _repeat_plain(self, row: int, next_tick: int) -> int:
-        """Executes the control periods of records again in compiled code, which is fast.
+        """Re-executes the ticks of plain records in compiled code, which is fast.
 
-        This is possible for a record if the state before it is known, and the log contains all
-        of its inputs (a plain record). The execution ends before the first record that differs.
+        A record is plain if the state before it is known, and the log contains all of its
+        inputs. Execution stops before the first record that differs.
 
         Args:
             row: Index of the first record.
             next_tick: Tick whose record is expected next.
 
         Returns:
-            The number of records that are identical to the execution. 0 if the next record must
-            be examined by itself.
+            The number of records that are identical to the re-execution. 0 if the next record
+            must be examined individually.
         """
         plain_rows = self._plain_rows
         if plain_rows is None or not self._certain or self._law_failed:
@@ -522,13 +519,13 @@ class _SiteVerifier:
         return repeated_count
 
     def _examine_record(self, row: int, next_tick: int) -> int:
-        """Checks that one record has the expected tick, and that its results can be repeated.
+        """Checks that one record has the expected tick, and that its results can be reproduced.
 
-        A tick is a control period. Gaps and differences are added to the result.
+        Gaps and differences are added to the result.
 
         Args:
             row: Index of the record.
-            next_tick: Tick (control period) whose record is expected next.
+            next_tick: Tick whose record is expected next.
 
         Returns:
             Tick whose record is expected after this record.
@@ -557,14 +554,14 @@ class _SiteVerifier:
         return state.tick + 1
 
     def _execute_record(self, row: int, state: State) -> None:
-        """Judges a record: executes its tick again, and compares the result with the record.
+        """Judges a record by re-executing its tick and comparing the result with the record.
 
-        The tick can be executed if the state of the site before it is certain, that is, if the
-        state follows from the tick before. If the state is uncertain, it is restored from the
-        two records before, if possible. Otherwise only the sender of the record is checked.
+        The tick can be executed if the state of the site before it is certain, that is, if it
+        follows from the previous tick. An uncertain state is restored from the two preceding
+        records if possible. Otherwise, only the sender of the record is checked.
 
-        The record is counted in the result as identical, as different, or as unjudged. After a
-        control law has failed, no further tick of the site is executed.
+        The record is counted in the result as identical, different or unjudged. After a control
+        law has failed, no further tick of the site is executed.
 
         Args:
             row: Row of the record.
@@ -604,7 +601,7 @@ class _SiteVerifier:
             result.add_difference(difference)
 
     def _can_resume(self, row: int) -> bool:
-        """True if the records before the given row suffice to restore the state of the site."""
+        """Returns True if the records before a row suffice to restore the state of the site."""
         if self._law_failed or row - 2 < self._start_row:
             return False
         return self._inputs.can_resume(row, detached=self._detached)
@@ -612,8 +609,8 @@ class _SiteVerifier:
     def _change_start(self, row: int, next_tick: int) -> int:
         """Continues with another start (boot) of the site, to which a record belongs.
 
-        A site that left the session and returned has several starts, each with a new number
-        (boot). Between the last record of the previous start and the first tick of this start,
+        A site that left the session and returned has several starts, each with a new boot
+        number. Between the last record of the previous start and the first tick of this start,
         there may be two ranges of ticks:
 
         - A gap: the site executed these ticks, but their records are missing from the log.
@@ -626,9 +623,9 @@ class _SiteVerifier:
             next_tick: Tick that was expected next.
 
         Returns:
-            Tick that is expected next: the first tick of the start. If the log does not state
-            this tick, or if it has been examined already, the site is not restarted, and the
-            result is `next_tick`.
+            Tick that is expected next, which is the first tick of the start. If the log does
+            not state this tick, or if it has already been examined, the site is not restarted,
+            and the result is `next_tick`.
         """
         name = self._log.name
         self._boot = self._read_boot(row)
@@ -655,26 +652,26 @@ class _SiteVerifier:
         return first_tick
 
     def _read_boot(self, row: int) -> int:
-        """Returns the boot in a record, the number that identifies a start of the site."""
+        """Returns the boot in a record (the number that identifies a start of the site)."""
         if self._plain_rows is not None:
             return self._plain_rows.read_boot(row)
         return self._states[row].boot
 
     def _set_site(self, site: Site) -> None:
-        """Replaces the executed site by another site."""
+        """Replaces the executed site with another site."""
         self._site = site
         self._repeater = None
 
     def _replace_site(self, row: int, state: State) -> None:
-        """Replaces the simulated site by a new site, to find control laws with hidden state.
+        """Replaces the simulated site with a new one, to reveal control laws with hidden state.
 
         A control law must keep all its state in its `memory`, which the records contain. Any
-        other state is lost by the replacement, so that the following records differ and the
-        fault is found.
+        other state is lost in the replacement, so the following records differ and the fault is
+        found.
 
         This method only marks the state as uncertain. The caller then restores the state from
-        the two preceding records, as after a gap of the log. Nothing happens if the state is
-        uncertain already, or cannot be restored.
+        the two preceding records, as after a gap in the log. Nothing happens if the state is
+        already uncertain, or cannot be restored.
 
         Args:
             row: Row of the next record.
@@ -700,11 +697,11 @@ class _SiteVerifier:
         )
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Reports a record that was not written by the process that is repeated.
+        """Reports a record that was not written by the process that is being re-executed.
 
         Returns:
-            The difference, if the record (result of a control period) states another start of
-            the process (boot) or another site. None otherwise.
+            The difference if the record names another start of the process (boot) or another
+            site, otherwise None.
         """
         name = self._log.name
         if state.boot != self._boot:
@@ -715,7 +712,7 @@ class _SiteVerifier:
         return None
 
     def _verify_record(self, row: int, state: State) -> None:
-        """Executes the control period of a record again, and compares the results.
+        """Executes the tick of a record again, and compares the results.
 
         Args:
             row: Row of the record.
@@ -775,14 +772,13 @@ class _SiteVerifier:
             result.add_difference(difference)
 
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
-        """Returns the changes up to a tick (control period) that have not been executed yet.
+        """Returns the changes up to a tick that have not been executed yet.
 
-        A change is a new model of a link, or new dominance factors (how strongly the site
-        follows its peers), or a command to the site (arm controller), such as a stop. The log
-        contains its text. An invalid text proves that the log is not that of a real run, so the
-        difference is reported.
+        A change is a new link model, a new set of dominance factors, or a command to the site,
+        such as a stop. The log contains it as text. An invalid text proves that the log is not
+        that of a real run, and is reported as a difference.
 
-        At most `MAX_RAMPS` changes can wait at a site. Further changes are left out. The
+        At most `MAX_RAMPS` changes can be pending at a site. Further changes are left out. The
         changes are also stored in `_applied`, so that `_replace_site` can repeat them.
 
         Args:
@@ -790,7 +786,7 @@ class _SiteVerifier:
 
         Returns:
             The changes before the first invalid change, and the difference that reports the
-            invalid change. The difference is None if all changes are valid.
+            invalid change, which is None if all changes are valid.
         """
         changes: list[CoreChange] = []
         for change_tick, text in self._inputs.pop_changes(tick):
@@ -814,13 +810,12 @@ class _SiteVerifier:
     ) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
         """Checks the arrivals of samples that a record lists, and returns the possible ones.
 
-        A sample is the state that another site (arm controller), a peer, sends in each tick
-        (control period). An arrival is impossible if there is no such peer, or if the peer
-        never executed such a tick.
+        An arrival is impossible if there is no such peer, or if the peer never executed the
+        tick in which the sample is said to have been sent.
 
         Returns:
             The arrivals before the first impossible arrival, and the difference that reports
-            the impossible arrival. The difference is None if all arrivals are possible.
+            the impossible arrival, which is None if all arrivals are possible.
         """
         samples = self._inputs.samples
         ends = self._inputs.ends
@@ -842,21 +837,22 @@ def verify_log(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> VerifyResult:
-    """Executes every site of a log again, and compares each record with the result.
+    """Re-executes every site of a log, and compares each record with the result.
 
-    If all records agree, the log contains what its scenario and its recorded inputs produce. A
-    rerun executes some sites with changed settings, and copies the records of the other sites
-    from a source log. The copied records are compared with the source log, and these sites are
-    executed from the source log. This requires that the source log is in the same folder.
+    If all records agree, the log contains exactly what its scenario and its recorded inputs
+    produce. The log of a rerun contains some sites that were executed with changed settings,
+    and others whose records were copied from a source log. The copied records are compared with
+    the source log, and these sites are re-executed from the source log, which must be in the
+    same folder.
 
     Args:
-        log: Log of a run or of a rerun that is to be checked.
-        progress: Function that is called now and then with the number of executed records and
-            their total.
+        log: Log of a run or rerun.
+        progress: Function that is called from time to time with the number of executed records
+            and their total.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         resume_every: In every tick that is divisible by this number, the site is replaced by a
-            new site that is restored from the records. This reveals state that a law keeps
-            outside of its `memory`. 0 means never.
+            new site restored from the records. This reveals state that a law keeps outside its
+            `memory`. 0 means never.
 
     Raises:
         LogError: A record cannot be read.
@@ -884,7 +880,7 @@ def verify_log(
 
 
 def _make_result(log: Log, min_coverage: float) -> VerifyResult:
-    """Returns an empty result for a log. The integrity of the log is already judged."""
+    """Returns an empty result for a log, in which only its integrity has been judged."""
     return VerifyResult(
         whole_run=log.session.get("fingerprint") == compute_fingerprint(),
         coverage=Coverage({}, {site: log.expected_ticks(site) for site in log.sites}),
@@ -902,21 +898,20 @@ def _execute_sites(
 ) -> None:
     """Executes the given sites of a log, and adds the counts and differences to a result.
 
-    Sites (arm controllers) whose control law may not run are left out.
+    Sites whose control law may not run are left out.
 
     Args:
         log: The log.
         sites: Names of the sites.
-        result: Receives the counts and differences.
-        report: Function that is called now and then with the number of records (results of
-            control periods) so far.
+        result: Object to which the counts and differences are added.
+        report: Function that is called from time to time with the number of records so far.
         resume_every: See `verify_log`.
     """
     # On another platform, each tick is computed from the two records before it.
     samples = SampleTable.of_log(log) if result.whole_run else None
     if samples is None:
         _map_records(log, lazy=False)  # raises an error if a record cannot be read
-    withheld_laws = [law for law in find_user_laws(log.scenario) if not law.allowed]
+    withheld_laws = [law for law in log.scenario.inspect_user_laws() if not law.allowed]
     withheld_sites = [name for law in withheld_laws for name in law.sites if name in sites]
     result.withheld += withheld_sites
     for name in withheld_sites:
@@ -932,11 +927,11 @@ def _execute_sites(
 
 
 def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
-    """Returns the records of a site (arm controller), decoded now or on first access.
+    """Returns the records of a site, decoded now or on first access.
 
     Args:
         site_log: Records of the site.
-        lazy: True if only few of them will be accessed.
+        lazy: True if only a few of them will be accessed.
     """
     if lazy:
         return LazyRecords(site_log.payloads, site_log.decode, heavy=True)
@@ -944,15 +939,14 @@ def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
 
 
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
-    """Returns the records of all sites (arm controllers) of a log, by site and tick.
+    """Returns the records of all sites of a log, keyed by site and tick.
 
-    A tick is a control period. A site that is executed again finds in these records what it
-    received from other sites.
+    When a site is re-executed, it looks up the samples that it received in these records.
 
     Args:
         log: The log.
-        lazy: True if only few records (results of control periods) will be accessed. They are
-            then decoded when they are accessed, and not all of them at once.
+        lazy: True if only a few records will be accessed. They are then decoded on access
+            instead of all at once.
     """
     if not lazy:
         return {name: log[name].by_tick for name in log.sites}
@@ -965,14 +959,12 @@ def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
     """Checks that the records of a site in a rerun are copies of those in the source log.
 
-    A rerun executes some sites (arm controllers) of a log again with other settings, and copies
-    the records (results of control periods) of the others. The first difference is added to the
-    result.
+    The first difference is added to the result.
 
     Args:
         recorded: Records of the site in the rerun.
         source: Records of the site in the source log.
-        result: Receives the difference.
+        result: Object to which the difference is added.
     """
     if recorded.payloads == source.payloads:
         return
@@ -993,15 +985,13 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
 
 
 def _open_rerun_source(log: Log) -> Log | None:
-    """Opens the source log of a rerun, a repetition with changed settings.
-
-    It must be in the same folder as the rerun.
+    """Opens the source log of a rerun, which must be in the same folder.
 
     Args:
-        log: Log of the rerun. It states the hashes of the files of its source.
+        log: Log of the rerun, which states the hashes of the files of its source.
 
     Returns:
-        The source log. None if its files are missing, or have other hashes.
+        The source log, or None if its files are missing or have other hashes.
     """
     names = log.session.get("rerun_of", "").split()
     digests = log.session.get("rerun_of_sha256", "").split()

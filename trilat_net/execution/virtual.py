@@ -1,17 +1,16 @@
 """Simulates an experiment without real clocks, processes or a network, and writes its log.
 
 A counter takes the place of the clock, and a simulated network takes the place of the message
-bus. The log has the same form as the log of a live session: it contains, for every arm, the
-record of every tick (period of the control loop), statistics of the network links, and events.
-All tools for logs therefore work on simulations, too.
+bus. The log has the same format as that of a live session. For every arm, it contains the
+record of every tick, statistics of the network links, and events. All tools for logs can
+therefore be used on simulations too.
 
 Invariant:
-    - An arm advances only by `Site.step`. Ticks are executed in the order of their nominal
-      times. Ticks of the same time are executed in the order of the sites (the controllers of
-      the arms) in the scenario.
-    - Therefore two runs of a scenario with the same seed write the same file, byte for byte.
-    - A message of an older schema version is written in the present version. A message of the
-      present version keeps its bytes.
+    - An arm advances only through `Site.step`. Ticks are executed in order of their nominal
+      time; simultaneous ticks are executed in scenario order of their sites.
+    - Two runs of a scenario with the same seed therefore write the same file, byte for byte.
+    - A message with an older schema version is written with the current version. A message with
+      the current version keeps its bytes.
 """
 
 import bisect
@@ -62,21 +61,20 @@ from ..net import (
 from ..own_code import ImportedLaw
 from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Arrival, Mode, TickRecord
-from ..scenario import POLICY, PlantPlayer, Scenario, make_hand_players, make_plant_players
+from ..scenario import POLICY, HandPlayer, PlantPlayer, Scenario
 from .resumption import select_peer_channels
 from .virtual_network import Network, PromptNetwork
 
 
 class SiteEntry(NamedTuple):
-    """One message of an arm controller (site), ready to be written to a log.
+    """One message from a site, ready to be written to a log.
 
     Attributes:
         site: Name of the site that sends the message.
         t_ns: Nominal time of the message, in ns after the epoch (the common start time).
             Messages are written in this order.
         sent_ns: Time at which the site sent the message, in ns after the epoch.
-        channel: Channel of the site: "state" for records (results of control periods), "link"
-            for statistics, or "event".
+        channel: Channel of the site: "state" for records, "link" for statistics, or "event".
         sequence: Tick of a record or of statistics, or number of an event.
         payload: Encoded message.
         message: Decoded message.
@@ -94,25 +92,25 @@ class SiteEntry(NamedTuple):
 class SiteChannels:
     """Channels of one site in a log that is being written: records, statistics and events.
 
-    The `make_…` methods convert ticks (control periods) and messages to entries, and `write`
-    writes an entry to the log. For each channel, an account counts the messages, so that the
-    log can state whether messages are missing.
+    The `make_…` methods convert ticks and messages to entries, and `write` writes an entry to
+    the log. The messages of each channel are counted, so that the log can state whether any are
+    missing.
 
     Args:
         scenario: Scenario of the log.
         session: Name of the session of the log.
-        site: Name of the site (arm controller).
+        site: Name of the site.
         boot: Number that identifies this start of the site. Every message contains it.
 
     Attributes:
-        peers: Names of the other sites, in the order of the scenario.
+        peers: Names of the other sites, in scenario order.
         keys: Key of each channel, under which its messages are published.
-        accounts: Account of the messages of each channel.
+        accounts: Message count of each channel.
         ticks: Number of ticks that the site has executed.
     """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
-        """Prepares the numbering of a site's messages. No message has been written yet."""
+        """Prepares the numbering of a site's messages. No message is written yet."""
         settings = scenario.sites[site]
         self.peers = scenario.peers(site)
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
@@ -132,14 +130,14 @@ class SiteChannels:
         """Returns the statistics and events that follow the record of a tick in a log.
 
         Args:
-            output: Record of the tick (control period): the stored result.
+            output: Record of the tick.
             stats: Statistics of the site's links. None if they are not due in this tick.
-            law_failure: Error of a user's control law that changed the mode of the site (arm
-                controller). None if there was no error.
+            law_failure: Error in a user's control law that changed the mode of the site. None
+                if there was no error.
 
         Returns:
-            An entry for the statistics, and an entry for an event if the mode of the site has
-            changed. Empty if there is nothing to report.
+            One entry for the statistics if they are due, and one for an event if the mode of
+            the site has changed.
         """
         self.ticks = output.tick + 1
         self._last_ns = output.t_ns
@@ -153,7 +151,7 @@ class SiteChannels:
         return entries
 
     def _make_mode_entry(self, output: TickRecord, law_failure: Exception | None) -> SiteEntry:
-        """Returns the event of a change of the site's mode, for example after a fault."""
+        """Returns the event for a change of the site's mode, for example after a fault."""
         text = describe_mode(self._site, output, glides=self._glides, law_failure=law_failure)
         kind = "diverged" if output.mode is Mode.DIVERGED else "mode"
         return self.make_new_event_entry(kind, text, output.t_ns)
@@ -161,13 +159,12 @@ class SiteChannels:
     def _exclude_skipped_ticks(self, tick: int, cmd: Sequence[str]) -> None:
         """Excludes the ticks that a site skipped from the counts of missing messages.
 
-        A site (arm controller) skips ticks if its control loop has fallen behind. It publishes
-        nothing for these ticks. The next record (result of a control period) states their
-        number among its commands.
+        A site skips ticks if its control loop has fallen behind, and publishes nothing for
+        these ticks. Their number is stated among the commands in the next record.
 
         Args:
             tick: Tick of the record.
-            cmd: Texts of the commands in the record.
+            cmd: Text of each command in the record.
         """
         skipped = count_skipped_ticks(cmd)
         if not skipped:
@@ -177,7 +174,7 @@ class SiteChannels:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the message that tells readers of the log that a site has ended.
+        """Returns the event that marks the end of a site in the log.
 
         Args:
             t_ns: Time of the event, in ns after the epoch (the common start time). By default,
@@ -188,13 +185,11 @@ class SiteChannels:
         return self.make_new_event_entry("end", text, end_ns)
 
     def make_new_event_entry(self, kind: str, text: str, t_ns: int) -> SiteEntry:
-        """Returns a notable occurrence at a site (event) as a message for the log.
-
-        The event gets the next event number of the site (arm controller).
+        """Creates an event of the site, with the next event number, as an entry for the log.
 
         Args:
             kind: Kind of the event, for programs.
-            text: Sentence of the event, for people.
+            text: Description of the event in one sentence, for people.
             t_ns: Time of the event, in ns after the epoch.
         """
         number = self._event_count
@@ -211,12 +206,12 @@ class SiteChannels:
         return self.make_event_entry(event, number)
 
     def make_record_entry(self, state: State, payload: bytes) -> SiteEntry:
-        """Returns the record of a tick (control period) as a message for the log.
+        """Returns the record of a tick as an entry for the log.
 
-        A record in the format of an older version is encoded again in the current format.
+        A record in the format of an older version is re-encoded in the current format.
 
         Args:
-            state: The record: the stored result of the tick.
+            state: The record.
             payload: The encoded form of the same record.
         """
         self._exclude_skipped_ticks(state.tick, state.cmd)
@@ -251,13 +246,12 @@ class SiteChannels:
         )
 
     def make_stats_entry(self, stats: LinkStats) -> SiteEntry:
-        """Returns statistics of a site's links as a message for the log.
+        """Returns statistics of a site's links as an entry for the log.
 
-        Statistics in the format of an older version are converted to the present version.
+        Statistics in the format of an older version are converted to the current version.
 
         Args:
-            stats: The statistics, for example the numbers of received and lost samples (sent
-                states).
+            stats: The statistics, for example the numbers of received and lost samples.
         """
         converted = stats
         if stats.v != VERSION:
@@ -273,13 +267,11 @@ class SiteChannels:
         )
 
     def make_event_entry(self, event: Event, number: int) -> SiteEntry:
-        """Converts an event of a site, such as a change of its mode, to a message for a log.
-
-        A site is a process that runs one arm. It published the event in an earlier run.
+        """Converts an event that a site published in an earlier run to an entry for the log.
 
         Args:
-            event: The event.
-            number: Number of the event. It is used only if the event itself has none.
+            event: The event, such as a change of the site's mode.
+            number: Number of the event, used only if the event itself has none.
         """
         has_number = event.n >= 0  # events of the oldest versions have no number
         numbered = event if has_number else msgspec.structs.replace(event, n=number)
@@ -299,7 +291,7 @@ class SiteChannels:
         """Writes a message of the site to the log, and counts it for the completeness check.
 
         Args:
-            entry: The message, as one of the `make_…` methods returned it.
+            entry: The message, as returned by one of the `make_…` methods.
             writer: Writer of the log.
             epoch_unix_ns: Unix time of the epoch (the common start time of the sites), in ns. 0
                 in virtual time.
@@ -312,16 +304,12 @@ class SiteChannels:
 
 
 def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
-    """Returns a string for each channel of a log, with the number of its messages.
+    """Returns a mapping from topic to a string with the message count of each channel.
 
-    A channel is a series of messages of one kind from one site (process that runs one arm). A
-    log contains these texts, so that a reader notices missing messages.
+    The log stores these strings, which allow a reader to detect missing messages.
 
     Args:
         sites: Channels of the sites, after all their messages have been written.
-
-    Returns:
-        The texts, by the topic of the channel.
     """
     return {
         f"/{site.keys[channel]}": f"{account.describe()}, overflowed 0"
@@ -331,14 +319,12 @@ def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
 
 
 class SiteTick(NamedTuple):
-    """One tick of one site (arm controller) in virtual time, after it was executed.
-
-    A tick is one period of the site's control loop.
+    """One executed tick of one site in virtual time.
 
     Attributes:
-        site: The site, in the state after the tick.
-        arrivals: Samples of other sites that arrived in this tick.
-        output: Record of the tick: the stored result.
+        site: The site, in its state after the tick.
+        arrivals: Samples from other sites that arrived in this tick.
+        output: Record of the tick.
     """
 
     site: Site
@@ -347,28 +333,28 @@ class SiteTick(NamedTuple):
 
 
 ChangeSchedule = Mapping[str, Mapping[int, Sequence[CoreChange]]]
-"""Changes, by site and by the tick at which they take effect."""
+"""Changes, keyed by site and by the tick at which they take effect."""
 PlantSchedule = Mapping[str, Mapping[int, PlantState]]
-"""Measured state of each external arm, by site and tick."""
+"""Measured states of external arms, keyed by site and tick."""
 HandTracks = Mapping[str, Callable[[Site, int], Sequence[float]]]
 """For each site with a live operator, a function that returns the operator's action in a tick.
 
-Its arguments are the site and the number of the site's next tick.
+The function receives the site and the number of the site's next tick.
 """
 
 
 def check_virtual(scenario: Scenario) -> None:
-    """Checks that a scenario can run in virtual time, before anything is written.
+    """Raises ScenarioError if a scenario cannot run in virtual time.
 
-    In virtual time, all sites (simulated processes that each run one arm) run in one process. A
-    real robot cannot take part, but an arm whose motion a user's program computes can.
+    In virtual time, all sites run in a single process. A real robot cannot take part, but an
+    arm whose motion is computed by a user's program can.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
 
     Raises:
         ScenarioError: An arm is a real robot, a user's control law cannot be created, or the
-            file of the law has another hash than the scenario states.
+            file of the law has a different hash than stated in the scenario.
     """
     # Arms that this program does not simulate are real robots, or belong to users' programs.
     real_robots = set(scenario.outside)
@@ -384,9 +370,8 @@ def check_virtual(scenario: Scenario) -> None:
 def _find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
     """Finds the ticks that a site skipped because its control loop was too late.
 
-    A site is a process that runs one arm, and a tick is a period of its control loop. The
-    record (result of a control period) of the next executed tick states the number of skipped
-    ticks, in the form of a change.
+    The number of skipped ticks is stated in the record of the next executed tick, in the form
+    of a change.
 
     Args:
         commands: For each tick, the changes that the site applied before it.
@@ -414,14 +399,13 @@ def execute_virtual(
 ) -> Iterator[SiteTick]:
     """Executes all sites of a scenario in virtual time, and yields every tick of every site.
 
-    In virtual time, the sites run in one process, as fast as possible. A tick is one period of
-    a site's control loop. Ticks are executed in the order of their nominal times, and ticks of
-    the same time in the order of the sites. A site waits while other sites are executed, as
-    long as samples that it needs have not been sent. If the arm of a site leaves its limits,
-    the run ends with the ticks of that time.
+    In virtual time, the sites run in one process, as fast as possible. Ticks are executed in
+    order of their nominal time; simultaneous ticks are executed in scenario order of their
+    sites. A site is held back until the samples that it needs have been sent. If the arm of a
+    site leaves its limits, the run ends with the ticks of that time.
 
     Args:
-        scenario: Description of the experiment, with its sites and links.
+        scenario: The scenario, with its sites and links.
         network: Network between the sites. By default, every sample arrives in the first tick
             after its time stamp.
         commands: Changes that take effect during the run.
@@ -432,7 +416,7 @@ def execute_virtual(
         plants: Users' programs that move the arms of sites.
 
     Raises:
-        ScenarioError: An arm is external, and neither `measured` nor `plants` contains it.
+        ScenarioError: An arm is external but appears in neither `measured` nor `plants`.
         LawFailed: A user's control law failed.
         PlantFailed: A user's plant failed.
     """
@@ -486,9 +470,8 @@ def _find_ready(
 ) -> int:
     """Selects the site that executes the next tick of a simulation.
 
-    A site, the simulated process of one arm, can execute its next tick (period of the control
-    loop) as soon as the samples (sent states) that it needs are in the simulated network. Of
-    the sites that are ready, the site with the earliest tick is selected.
+    A site can execute its next tick as soon as the samples that it needs are in the simulated
+    network. Of the sites that are ready, the one with the earliest tick is selected.
 
     Args:
         pending: Next tick of each site, as (time in ns, index of the site, tick), in order of
@@ -506,7 +489,7 @@ def _find_ready(
 
 
 class _VirtualChannels(SiteChannels):
-    """Channels of one site of a virtual run, written while the run is executed."""
+    """Channels of one site in a virtual run, written while the run is executed."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         boot = compute_virtual_boot(scenario.sha256, site.name)
@@ -516,13 +499,10 @@ class _VirtualChannels(SiteChannels):
         self._stats = LoopStats(site, boot)
 
     def write_tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
-        """Writes the record of a tick to the log, and then its statistics and events.
-
-        A tick is one period of the control loop.
+        """Writes the record of a tick to the log, followed by its statistics and events.
 
         Args:
-            arrivals: States of other sites (processes that each run one arm) that arrived for
-                this tick.
+            arrivals: Samples from other sites that arrived for this tick.
             output: Results of the tick.
         """
         payload = encode_state(
@@ -546,11 +526,10 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes the reports of an operator's connection to the log, and empties the list.
+        """Writes the reports about an operator's connection to the log, and empties the list.
 
         Args:
-            news: The reports, as pairs of a tick (number of a period of the control loop) and a
-                sentence.
+            news: The reports, as pairs of tick number and sentence.
         """
         for k, text in news:
             t_ns = k * NS_PER_S // self._rate_hz
@@ -571,32 +550,31 @@ def write_virtual_log(
 ) -> bool:
     """Simulates a scenario in virtual time, and writes the log of the run to a stream.
 
-    The log is always completed: after the last tick, after `stopped` returns True, and after an
-    error.
+    The log is always completed, even if `stopped` returns True or an error occurs.
 
     Args:
-        scenario: Description of the experiment, with its sites and links.
+        scenario: The scenario, with its sites and links.
         stream: Stream to which the log is written. It is not closed.
         network: Network between the sites, see `execute_virtual`.
         stopped: Function that is called after each tick. The run ends if it returns True.
-        views_hz: Rate of the additional channels for viewers, in Hz, see
-            `log.view_rates`.
+        views_hz: Rate of the additional channels for viewers, in Hz, see `log.view_rates`.
         hands: Actions of live operators, see `execute_virtual`. They replace the programs that
             the scenario names as operators.
         commands: Changes that take effect during the run.
-        policies: Sites whose live operator is a trained program. The log has an event for each.
+        policies: Sites whose live operator is a trained program. The log contains one event for
+            each.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
 
     Raises:
-        LogError: The disk refused to store the log.
+        LogError: Writing to the disk failed.
         ScenarioError: The scenario cannot run in virtual time. Nothing has been written.
         LawFailed: A user's control law failed. The log contains an event with the reason.
     """
     check_virtual(scenario)
-    hand_players = make_hand_players(scenario)
-    plants = make_plant_players(scenario)
+    hand_players = HandPlayer.make_all(scenario)
+    plants = PlantPlayer.make_all(scenario)
     tracks: dict[str, Callable[[Site, int], Sequence[float]]] = {
         name: player.track for name, player in hand_players.items()
     }
@@ -664,21 +642,22 @@ def record_virtual(
     """Simulates a scenario faster than real time, and writes the log of the run to a file.
 
     Args:
-        scenario: Description of the experiment, with its sites and links.
+        scenario: The scenario, with its sites and links.
         path: File to which the log is written.
         force: If True, an existing file is replaced.
-        stopped: Function that is called after each tick (control period). The run ends if it
-            returns True.
+        stopped: Function that is called after each tick. The run ends if it returns True.
         views_hz: Rate of the additional channels for viewers, in Hz.
         hands: Actions of live operators, see `execute_virtual`.
-        policies: Sites whose live operator is a trained program. The log has an event for each.
+        policies: Sites whose live operator is a trained program. The log contains one event for
+            each.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
 
     Raises:
         UsageError: The file exists, or cannot be created.
-        LogRefused: The disk refused to store the log. The error names the part that is kept.
+        LogRefused: Writing to the disk failed. The error names the part of the log that is
+            kept.
         ScenarioError: The scenario cannot run in virtual time. No file is written.
         LawFailed: A user's control law failed. The file contains the ticks before the failure.
     """
@@ -694,13 +673,13 @@ def record_virtual(
 
 
 class SimulatedLog(Log):
-    """Log of a run that this object simulates in virtual time, held in memory.
+    """Simulates a run in virtual time, and holds its log in memory.
 
-    In virtual time, all sites (arm controllers) run in this process, as fast as possible. The
-    object can be used like a log that was read from a file, and `save` writes it to a file.
+    In virtual time, all sites run in this process, as fast as possible. The object can be used
+    like a log read from a file, and `save` writes it to a file.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
         hands: Actions of live operators, see `execute_virtual`. By default, nobody moves the
             arms.
 
@@ -724,10 +703,9 @@ class SimulatedLog(Log):
 
     @classmethod
     def without_operators(cls, log: Log) -> "SimulatedLog":
-        """Simulates the experiment of a log, up to its last record, but without operators.
+        """Simulates the experiment of a log, up to its last record, without operators.
 
-        An operator is a person or program that moves an arm. The result shows how the arms move
-        without operators.
+        The result shows how the arms would move if nobody guided them.
 
         Args:
             log: The log that contains the scenario.
@@ -737,7 +715,7 @@ class SimulatedLog(Log):
     def save(self, path: str | Path, *, force: bool = False) -> Path:
         """Writes the log to a file, as `trilat sim -o` does.
 
-        The scenario runs a second time, because the file additionally contains channels for
+        The scenario is simulated a second time, because the file also contains channels for
         viewers.
 
         Args:
@@ -749,7 +727,7 @@ class SimulatedLog(Log):
 
         Raises:
             UsageError: The file exists, or cannot be created.
-            LogRefused: The disk refused to store the log.
+            LogRefused: Writing to the disk failed.
         """
         with LogFile(Path(path), force=force) as stream:
             write_virtual_log(
@@ -759,7 +737,7 @@ class SimulatedLog(Log):
 
 
 def cut_to_records(log: Log) -> Scenario:
-    """Returns the scenario of a log, shortened so that it ends at the last record."""
+    """Returns the scenario of a log, shortened to end at the last record."""
     ends_s = [
         (log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])
     ]

@@ -1,16 +1,16 @@
 """Compares a log with a simulation of its run, to find the effect of late and lost messages.
 
-In each control period, an arm sends its state, a sample, to the other arms. The receiver holds
-a sample until the delay that the scenario prescribes has passed. Then the sample is due. As
-long as the real network delivers every sample before it is due, the network has no effect on
-the run, and a simulation without a network gives the same numbers. The first difference shows
-when the network was too slow.
+In each tick, an arm sends its state (a sample) to the other arms. The receiver holds a sample
+until the delay prescribed by the scenario has passed, at which point the sample is due. As long
+as the real network delivers every sample before it is due, the network has no effect on the
+run, and a simulation without a network gives the same results. The first difference shows when
+the network was too slow.
 
 Invariant (L2):
-    - A simulation in which all samples arrive when they arrived in the log equals the log in
-      every tick (control period).
-    - A simulation in which all samples arrive at once equals the log up to the first sample
-      that was late, or was lost in the network.
+    - A simulation in which all samples arrive when they arrived in the log agrees with the log
+      in every tick.
+    - A simulation in which all samples arrive at once agrees with the log up to the first
+      sample that was late or lost in the network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -39,9 +39,8 @@ class _RecordComparison(NamedTuple):
     """Result of comparing the records of a log with another execution of the same run.
 
     Attributes:
-        records: Number of records that were compared. A record is the stored result of one
-            tick (control period).
-        identical: Number of records in which all computed fields have the same bits.
+        records: Number of records that were compared.
+        identical: Number of records in which all computed fields are bit-identical.
         first: Difference in the earliest tick. None if all records are identical.
     """
 
@@ -50,12 +49,12 @@ class _RecordComparison(NamedTuple):
     first: RecordDifference | None
 
     def to_finding(self, label: str, excused_from: int | None) -> Finding:
-        """Returns the finding that states whether a log equals another execution of its run.
+        """Returns the finding on whether a log agrees with another execution of its run.
 
         Args:
             label: Name of the check.
-            excused_from: Tick (control period) from which differences are expected and do not
-                fail the check. None if there is no such tick.
+            excused_from: Tick from which differences are expected and do not fail the check.
+                None if there is no such tick.
         """
         first = self.first
         text = f"{self.identical}/{count_nouns(self.records, 'record')} identical"
@@ -66,11 +65,10 @@ class _RecordComparison(NamedTuple):
 
 
 class _LateSample(NamedTuple):
-    """Sample that had not arrived at its receiver when it should have come into use.
+    """Sample that had not arrived at its receiver when it was due.
 
-    A sample is the state that a site (arm controller) publishes in one tick (control period).
-    It is due after the delay that the scenario states for the link. Samples that are lost
-    according to the scenario are never due, and do not count.
+    A sample is due after the delay that the scenario prescribes for the link. Samples that are
+    lost according to the scenario are never due, and do not count.
 
     Attributes:
         site: Name of the receiver.
@@ -88,7 +86,7 @@ class _LateSample(NamedTuple):
     arrived_tick: int | None
 
     def __str__(self) -> str:
-        """Returns a sentence about the late message, for the report to the user."""
+        """Describes the late sample in one sentence, for the report to the user."""
         outcome = "never came"
         if self.arrived_tick is not None:
             outcome = f"came at tick {self.arrived_tick}"
@@ -103,10 +101,10 @@ def _compare_records(
 
     Args:
         log: Log whose records are compared.
-        executed: Results of the other execution in any order, each with the name of the site
-            (arm controller). Ticks (control periods) that the log does not contain are skipped.
-        arrivals: If True, the same samples must have arrived in each tick as well. Their
-            checksums are compared.
+        executed: Results of the other execution in any order, each with the name of the site.
+            Ticks that the log does not contain are skipped.
+        arrivals: If True, the same samples must have arrived in each tick too. Their checksums
+            are compared.
     """
     by_tick = {name: log[name].by_tick for name in log.sites}
     records = 0
@@ -135,18 +133,18 @@ def _compare_records(
 def find_absent_samples(log: Log) -> list[_LateSample]:
     """Finds every sample that was late or lost in the network of a live session.
 
-    A sample is the state that a site (process that runs one arm) sends in one tick (period of
-    its control loop). It is due at its receiver after the delay that the scenario describes.
+    A sample is due at its receiver after the delay prescribed by the scenario.
 
-    If records (results of control periods) of the receiver are missing, the log does not show
-    whether a sample was lost or arrived in these ticks. The sample counts as lost if the
-    receiver still uses an older sample in its first recorded tick at or after the due tick.
+    If records of the receiver are missing, the log does not show whether a sample was lost or
+    arrived in the missing ticks. The sample counts as lost if the receiver still uses an older
+    sample in its first recorded tick at or after the due tick.
 
     Args:
         log: Log of a live session.
 
     Returns:
-        The samples, by the tick in which they were due. Empty if all samples were in time.
+        The samples, in order of the tick in which they were due. Empty if all samples were on
+        time.
     """
     absent: list[_LateSample] = []
     for name in log.sites:
@@ -157,8 +155,7 @@ def find_absent_samples(log: Log) -> list[_LateSample]:
 def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
     """Finds the samples that had not arrived at one site when they were due.
 
-    A sample is the state that another site (peer) sent in one tick. It is due after the delay
-    that the scenario prescribes for the link.
+    A sample is due after the delay that the scenario prescribes for the link.
 
     Args:
         log: Log of a live session.
@@ -223,12 +220,11 @@ def _find_absent_at_site(log: Log, name: str) -> list[_LateSample]:
 
 
 def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
-    """True if a site still used an older sample of its peer when a given sample was due.
+    """Returns True if a site was still using an older sample when a given sample was due.
 
     Args:
         site_log: Records of the receiver.
-        sender: Name of the site (arm controller) that sent the sample, its state in one tick
-            (control period).
+        sender: Name of the site that sent the sample.
         tick: Tick in which the sample was sent.
         due_tick: Tick of the receiver in which the sample was due. If it has no record, the
             next record is examined.
@@ -240,19 +236,18 @@ def _uses_older(site_log: SiteLog, sender: str, tick: int, due_tick: int) -> boo
 class _VirtualComparison(NamedTuple):
     """Comparison of the log of a live session with simulations of the same experiment.
 
-    The comparison shows whether the real network changed the result beyond the delays and
-    losses that the scenario (description of the experiment) contains. A sample is the state
-    that a site, the process that runs one arm, sends to the other sites.
+    It shows whether the real network changed the result beyond the delays and losses prescribed
+    by the scenario.
 
     Attributes:
         fed: Comparison with a simulation in which each sample arrives when it arrived in the
-            session. All records (results of control periods) must be equal.
+            session. All records must be equal.
         plain: Comparison with a simulation of a perfect network, in which samples arrive at
             once. The records must be equal up to the first late or lost sample. If an arm is
             external, no records are compared, because its motion is known only for the recorded
             run.
-        absent: Samples that arrived too late or never, by the tick (control period) in which
-            they were due.
+        absent: Samples that arrived too late or never, in order of the tick in which they were
+            due.
     """
 
     fed: _RecordComparison
@@ -261,27 +256,20 @@ class _VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[_LateSample]:
-        """Messages that arrived later than the delay model of the scenario allows.
-
-        A message (sample) contains the state that a site (process that runs one arm) sends.
-        """
+        """Samples that arrived later than the scenario's delay model allows."""
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
     @property
     def lost(self) -> list[_LateSample]:
-        """Samples that the network lost, although it should have delivered them.
-
-        A sample is the state that a site (process that runs one arm) sends. Losses that the
-        scenario itself describes do not count.
-        """
+        """Samples that the network lost, excluding losses prescribed by the scenario."""
         return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property
     def excused_from(self) -> int | None:
         """First tick of the log that may differ from a simulation with a perfect network.
 
-        In this tick (period of the control loop), a site needed a sample, the state of another
-        site, that was late or lost. None if no sample was late or lost.
+        In this tick, a site needed a sample that was late or lost. None if no sample was late
+        or lost.
         """
         return self.absent[0].due_tick if self.absent else None
 
@@ -289,13 +277,13 @@ class _VirtualComparison(NamedTuple):
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> _VirtualComparison:
     """Compares a log with two simulations of its scenario in virtual time.
 
-    In the first simulation, samples arrive as in the log. In the second simulation, they arrive
-    at once. Both end at the last record of the log.
+    In the first simulation, samples arrive as in the log. In the second, they arrive at once.
+    Both end at the last record of the log.
 
     Args:
         log: Log of a live session, which contains its scenario.
-        progress: Function that is called now and then with the number of executed ticks and
-            their total.
+        progress: Function that is called from time to time with the number of executed ticks
+            and their total.
     """
     scenario = virtual.cut_to_records(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
@@ -314,19 +302,17 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
         def execute(
             network: Network | None, ticks_before: int
         ) -> Iterator[tuple[str, TickRecord]]:
-            """Simulates the scenario of the recorded session once more, tick by tick.
+            """Simulates the scenario of the recorded session again, tick by tick.
 
-            The simulation receives the commands, the actions of live operators and the motion
-            of external arms (arms that are not simulated) from the log. A tick (period of the
-            control loop) is executed when its record is read.
+            The commands, the actions of live operators and the motion of external arms are
+            taken from the log. A tick is executed when its record is read.
 
             Args:
-                network: Network that delivers the samples (sent states). If None, samples
-                    arrive at once.
-                ticks_before: Number of ticks of earlier simulations, for the progress.
+                network: Network that delivers the samples. If None, samples arrive at once.
+                ticks_before: Number of ticks of earlier simulations, for reporting progress.
 
             Yields:
-                Name of the site (arm controller), and record of the tick.
+                The name of the site and the record of the tick.
             """
             ticks = virtual.execute_virtual(
                 scenario=scenario,
@@ -351,9 +337,9 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
 
 
 def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns the messages that arrived at a site, by the control period (tick) that used them.
+    """Returns a mapping from tick to the samples that arrived at a site for that tick.
 
-    Arrivals in gaps of the log are assumed, unless too many records are missing.
+    Arrivals in gaps in the log are estimated, unless too many records are missing.
     """
     site_log = log[name]
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in site_log.peers]

@@ -1,12 +1,12 @@
 """Simulates when messages between arms arrive, in place of a real network.
 
-In each control period (tick), an arm sends its state, a sample, to the other arms. There are
-two kinds of networks:
+In each tick, an arm sends its state (a sample) to the other arms. There are two kinds of
+networks:
 
 - `PromptNetwork` delivers a sample in the first tick after it was sent.
 - `RecordedNetwork` delivers a sample in the tick in which it arrived according to a log. If
-  records are missing from the log, the arrivals in these ticks are estimated. If the number of
-  ticks per second was changed, the arrivals are converted.
+  records are missing from the log, the arrivals in their ticks are estimated. If the tick rate
+  was changed, the arrivals are converted.
 
 Invariant:
     - A network only decides when a sample arrives. The receiver then holds the sample until the
@@ -32,26 +32,22 @@ from .resumption import ArrivalEntry, make_arrival
 class Network(Protocol):
     """Interface of a network between the sites of a simulation in virtual time.
 
-    A network decides in which tick (control period) of the receiver a sample arrives. A sample
-    is the state that a site (arm controller) publishes in one tick. The simulation calls `send`
-    after each tick of a site, and `deliver` before each tick.
+    A network decides in which tick of the receiver a sample arrives. The simulation calls
+    `send` after each tick of a site, and `deliver` before each tick.
     """
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Accepts the state that an arm controller (site) sends, to deliver it to others later.
-
-        A site sends its state after each tick (period of its control loop).
+        """Accepts the sample that a site sends after a tick, for later delivery.
 
         Args:
             sender: Name of the site.
-            output: Results of the tick, which contain the state.
+            output: Results of the tick, which contain the sample.
         """
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True if all samples that a site receives in its next tick have been sent already.
+        """Returns True if all samples that a site receives in its next tick have been sent.
 
-        Only then can the next tick be executed. A site is a simulated process that runs one
-        arm, and a tick is a period of its control loop.
+        Only then can the next tick be executed.
 
         Args:
             receiver: Name of the site.
@@ -59,7 +55,7 @@ class Network(Protocol):
         """
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the messages that arrive at a site in one control period, in their order.
+        """Returns the samples that arrive at a site during one tick, in order of arrival.
 
         Args:
             receiver: Name of the site.
@@ -68,13 +64,13 @@ class Network(Protocol):
 
 
 class PromptNetwork:
-    """Simulated network that delivers every message without delay.
+    """Simulated network that delivers every sample without delay.
 
-    Each message (sample) arrives in the receiver's first tick (control period) after it was
-    sent. The delays that a scenario states are applied later, by the receiver.
+    A sample arrives in the receiver's first tick after it was sent. Delays prescribed by the
+    scenario are applied later, by the receiver.
 
     Args:
-        rates: Tick rate of each site, in Hz, by name.
+        rates: Mapping from site to tick rate, in Hz.
     """
 
     def __init__(self, rates: Mapping[str, int]) -> None:
@@ -85,20 +81,20 @@ class PromptNetwork:
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the state that a site sends in a tick until all others have received it."""
+        """Stores the sample that a site sends in a tick until all others have received it."""
         for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
 
     def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
-        """Returns True: a site can always execute its next control period without waiting.
+        """Returns True, because a site never has to wait before executing its next tick.
 
-        The sites are simulated in order of time, so all earlier states have been sent.
+        The sites are simulated in order of time, so all earlier samples have been sent.
         """
         return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the states sent before control period `k` that a site has not received."""
+        """Returns the samples sent before tick `k` that the site has not received yet."""
         now_ns = k * NS_PER_S // self._rates[receiver]
         arrivals = []
         for index, queue in enumerate(self._in_transit[receiver].values()):
@@ -110,14 +106,14 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Network in which samples arrive in the same ticks (control periods) as in a log.
+    """Simulated network in which samples arrive in the same ticks as in a log.
 
-    Only the times come from the log. The content of a sample is that of the running sender,
-    which may differ from the log if settings were changed.
+    Only the arrival times are taken from the log. The content of a sample is that of the
+    simulated sender, which may differ from the log if settings were changed.
 
     Args:
-        schedule: Arrivals at each site (arm controller), by tick of the receiver.
-        peers: For each site, the names of the other sites in the order of the scenario.
+        schedule: Arrivals at each site, keyed by tick of the receiver.
+        peers: For each site, the names of the other sites in scenario order.
     """
 
     def __init__(
@@ -133,19 +129,16 @@ class RecordedNetwork:
         self._checked = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores a sent state (sample) under its sender and tick, until it is delivered.
-
-        The delivery repeats the delays of the recorded run.
-        """
+        """Stores a sent sample under its sender and tick until it is delivered."""
         self._sent[sender, output.tick] = output
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True if all samples that the log lists for tick `k` of a receiver have been sent.
+        """Returns True if all samples that the log lists for a receiver's tick have been sent.
 
-        In a live session, a site (arm controller) whose loop ran late may have received samples
-        with later times than that of its own tick (control period). The senders of such samples
-        must run first. Meanwhile this method is called repeatedly. Each call continues with the
-        first sample that had not been sent when the last call ended.
+        In a live session, a site whose loop ran late may have received samples with later times
+        than that of its own tick. The senders of such samples must run first. Meanwhile, this
+        method is called repeatedly. Each call continues with the first sample that had not been
+        sent at the end of the previous call.
 
         Args:
             receiver: Name of the receiving site.
@@ -164,11 +157,11 @@ class RecordedNetwork:
         return sent_count == len(arrivals)
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns the samples that, according to the log, arrive in tick `k` of a receiver.
+        """Returns the samples that arrive in tick `k` of a receiver according to the log.
 
-        A sample (sent state) that its sender has not produced does not arrive. After a gap in
-        the log, more samples may be assumed to arrive than a tick (control period) accepts
-        (`MAX_ARRIVALS`). Then only the newest samples are returned.
+        A sample that its sender has not produced does not arrive. After a gap in the log, more
+        samples may be assumed to arrive than a tick accepts (`MAX_ARRIVALS`), in which case
+        only the newest ones are returned.
         """
         peers = self._peers[receiver]
         arrivals = []
@@ -180,17 +173,14 @@ class RecordedNetwork:
 
 
 class Deliveries(NamedTuple):
-    """Samples of other sites that one site received according to a log.
-
-    A site is a process that runs one arm. In each tick (period of its control loop) it sends a
-    sample, its state, to the other sites.
+    """Samples that one site received from other sites according to a log.
 
     Attributes:
-        entries: For each tick, the samples that arrived for it, in the order of arrival.
+        entries: For each tick, the samples that arrived for it, in order of arrival.
         unrecorded: Ticks between `first` and `last` whose record is missing from the log. Their
             entries are estimated.
         first: First tick with a record.
-        last: Last tick with a record. It is -1 if there are no records.
+        last: Last tick with a record. -1 if there are no records.
     """
 
     entries: dict[int, Sequence[ArrivalEntry]]
@@ -200,10 +190,9 @@ class Deliveries(NamedTuple):
 
     @classmethod
     def read(cls, site_log: SiteLog) -> "Deliveries":
-        """Reads from a site's records which states of other sites arrived in each tick.
+        """Reads the samples that arrived in each tick from a site's records.
 
-        A site is an arm controller, and a tick one of its control periods. Ticks without a
-        record are left out; `Deliveries.complete` fills them in.
+        Ticks without a record are left out; use `Deliveries.complete` to fill them in.
 
         Args:
             site_log: Records of the site, each of which lists the samples that arrived in its
@@ -234,17 +223,17 @@ class Deliveries(NamedTuple):
     ) -> "Deliveries":
         """Returns the arrivals at a site for every tick from its first to its last record.
 
-        If the record of a tick is missing, the log does not say which samples arrived in it. A
-        sample that no record lists is assumed to have arrived in a tick of this kind, if such a
-        tick is possible. Three conditions must hold: the tick is after the sample was sent; it
-        is after the arrival of the last earlier sample that a record lists; and it is before
-        the arrival of the first later sample. Of several possible ticks, the tick whose delay
-        is nearest to the median delay of the link is chosen.
+        If the record of a tick is missing, the log does not show which samples arrived in it. A
+        sample that no record lists is assumed to have arrived in such a tick, if one is
+        possible. A tick is possible if it is after the sample was sent, after the arrival of
+        the last earlier sample that a record lists, and before the arrival of the first later
+        sample. If several ticks are possible, the one whose delay is closest to the median
+        delay of the link is chosen.
 
         Args:
             site_log: Records of the site, each of which lists the samples that arrived in its
                 tick.
-            rates_hz: Tick rates of the sites that send samples to it (its peers), in Hz.
+            rates_hz: Tick rates of the site's peers, in Hz.
             last_ticks: Last tick of each peer, in the same order.
 
         Raises:
@@ -290,12 +279,12 @@ class Deliveries(NamedTuple):
         rates_hz: Sequence[int],
         new_rates_hz: Sequence[int],
     ) -> "Deliveries":
-        """Converts the arrivals of a log to arrivals for sites with other tick rates.
+        """Converts the arrivals of a log to arrivals for sites with different tick rates.
 
-        The network stays the same. For each sample of the new run, the last sample of the log
-        that was not sent later serves as its model. The new sample takes as long from its time
-        stamp to the tick of its arrival as the model did. If the model never arrived, the new
-        sample does not arrive either.
+        The network is assumed to be the same. Each sample of the new run is modelled on the
+        last sample of the log that was not sent later. The new sample takes as long from its
+        time stamp to the tick of its arrival as its model did. If the model never arrived,
+        neither does the new sample.
 
         Args:
             rate_hz: Tick rate of the site in the log, in Hz.
@@ -329,15 +318,15 @@ class Deliveries(NamedTuple):
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    """Returns when each state (sample) that a peer sent arrived for the first time.
+    """Returns when each sample from a peer arrived for the first time.
 
     Args:
         deliveries: Arrivals at the receiver.
         peer: Index of the sender among the receiver's peers.
 
     Returns:
-        For the tick (control period) of each sample, the tick of its first arrival and its
-        latency in microseconds.
+        A mapping from the tick of each sample to the tick of its first arrival and its latency
+        in microseconds.
     """
     first_arrivals: dict[int, tuple[int, int]] = {}
     for k in sorted(deliveries.entries):
@@ -355,9 +344,9 @@ def _assume_arrivals(
     peer_hz: int,
     end: int,
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yields assumed arrivals of messages from one peer that no record lists.
+    """Yields assumed arrivals of samples from one peer that no record lists.
 
-    Records are missing from the log, so that the true arrivals are not known.
+    Because records are missing from the log, the true arrivals are unknown.
 
     Args:
         recorded: Arrivals that the records list.
@@ -368,7 +357,7 @@ def _assume_arrivals(
         end: Last tick of the sender.
 
     Yields:
-        The tick of the arrival, and its entry in the form of a record's `rx`.
+        The tick of the arrival, and its entry in the format of a record's `rx`.
     """
     first_arrivals = _find_first_arrivals(recorded, peer)
     listed = sorted(first_arrivals)
@@ -413,5 +402,5 @@ def _assume_arrivals(
 
 
 def _round_up_to_tick(t_ns: int, rate_hz: int) -> int:
-    """Returns the first tick at or after a time, in exact integer arithmetic."""
+    """Returns the first tick at or after a time in ns, in exact integer arithmetic."""
     return -(-t_ns * rate_hz // NS_PER_S)

@@ -5,15 +5,14 @@ For example, one can repeat a session with a higher damping at the slave:
     result = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
     result.sites["s"].error_rms_rad, result.after["s"].q
 
-In open loop, only the replaced sites (the controllers of arms) are executed. The other sites
-keep their records and do not react. In closed loop, every site is executed, and each sample
-(the state that a site sends to the others) takes as long through the network as it did in the
-log.
+In open loop, only the replaced sites are executed. The other sites keep their records and do
+not react. In closed loop, every site is executed, and each sample spends as much time in the
+network as it did in the log.
 
 Invariant:
-    - Without changed settings, both modes reproduce the log, bit for bit.
-    - A figure such as the mean error is computed from the log and from the rerun over the same
-      times, at which the log contains a record and the rerun executed a tick (control period).
+    - Without changed settings, both modes reproduce the log bit for bit.
+    - A quantity such as the mean error is computed from the log and from the rerun over the
+      same ticks: those that have a record in the log and were executed in the rerun.
 """
 
 import io
@@ -47,7 +46,6 @@ from ..log import (
     open_log,
 )
 from ..net import READABLE, State, decode
-from ..own_code import find_user_laws
 from ..records import NS_PER_S, Mode
 from ..results import Result, finite_or_none
 from .rerun_execution import RerunExecution, RerunOverrides, RerunRequest, RerunTick
@@ -56,11 +54,11 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """A figure, such as an error, of a recorded run and of its repetition with changes.
+    """A quantity, such as an error, in the recorded run and in its rerun.
 
     Attributes:
         before: Value in the log.
-        after: Value in the rerun, the repeated execution with possibly changed settings.
+        after: Value in the rerun.
     """
 
     before: float
@@ -68,22 +66,21 @@ class LogAndRerun(NamedTuple):
 
 
 class _SiteEffect(NamedTuple):
-    """Effect of changed settings on one arm: how a repeated run differs from the log.
+    """Effect of changed settings on one arm: how a rerun differs from the log.
 
-    The figures describe a site (arm controller). They are computed from the ticks (control
-    periods) for which both the log and the repetition (rerun) have a record, and are None if
-    there is no such tick.
+    The figures are computed from the ticks for which both the log and the rerun have a record,
+    and are None if there is no such tick.
 
     Attributes:
         site: Name of the site.
-        executed: Number of executed ticks. A tick is one period of the control loop.
+        executed: Number of executed ticks.
         compared: Number of executed ticks for whose time the log contains a record.
-        identical: Number of compared ticks in which all computed fields have the same bits as
-            in the log. If settings were changed, the checksum of the arrivals is not compared.
+        identical: Number of compared ticks in which all computed fields are bit-identical to
+            the log. If settings were changed, the checksum of the arrivals is not compared.
         stands: Number of ticks whose record was copied from the log, because the log does not
             contain enough data to execute them.
         assumed: Number of executed ticks without a record in the log. The samples that arrived
-            in these ticks were assumed.
+            in these ticks were estimated.
         lacking: Number of samples that arrived, but whose content is missing from the log.
         first: First difference from the log. None if there is no difference, or if tick rates
             were changed.
@@ -118,11 +115,10 @@ class _SiteEffect(NamedTuple):
 
 
 class _LinkEffect(NamedTuple):
-    """Difference that a rerun makes to one link: how old the samples are when they are used.
+    """Effect of a rerun on one link: how old the samples are when they are used.
 
-    A link is the directed connection from one site (arm controller) to another. Ages are
-    computed from the ticks (control periods) in which the receiver uses a sample both in the
-    log and in the rerun.
+    Ages are computed from the ticks in which the receiver uses a sample both in the log and in
+    the rerun.
 
     Attributes:
         link: Name of the link, for example "m1->s".
@@ -138,17 +134,17 @@ class _LinkEffect(NamedTuple):
     def differs(self) -> bool:
         """True if the delays on a network link differ between the recorded and the new run.
 
-        The delay is measured as the age of the received data when they are used. Its mean and
-        its largest value are compared.
+        The delay is measured as the age of the received data when they are used. The mean and
+        the maximum are compared.
         """
         return any(pair.before != pair.after for pair in (self.age_mean_ms, self.age_max_ms))
 
 
 class _CommonRecords(NamedTuple):
-    """Records of a site (arm controller) in a log and in its rerun, paired by their times.
+    """Records of a site in a log and in its rerun, paired by time.
 
-    A rerun may have another tick rate than the log. Only records (results of control periods)
-    with equal times can be compared.
+    The tick rate of a rerun may differ from that of the log. Only records with equal times can
+    be compared.
 
     Attributes:
         before: Records of the log.
@@ -163,14 +159,13 @@ class _CommonRecords(NamedTuple):
     after_rows: Ints
 
     def compare(self, figure: Callable[[Array], float], field: str) -> LogAndRerun:
-        """Computes the same number from the records of the log and of the rerun.
+        """Computes the same quantity from the records of the log and of the rerun.
 
-        A rerun executes a log again, and a record contains the values of one tick (period of
-        the control loop). Only ticks with a record in both are used.
+        Only ticks that have a record in both are used.
 
         Args:
-            figure: Function that computes the number from values of shape (K, n), for K records
-                with n values each.
+            figure: Function that computes the quantity from an array of shape (K, n), for K
+                records with n values each.
             field: Name of the field of the records that contains the values.
         """
         before = figure(getattr(self.before, field)[self.before_rows])
@@ -185,10 +180,10 @@ def _compare_site_rerun(
     name: str,
     ticks: Sequence[RerunTick],
 ) -> tuple[_SiteEffect, list[_LinkEffect]]:
-    """Computes how a repeated run differs at one arm, and on the links to this arm.
+    """Computes how a rerun differs at one arm, and on the links to this arm.
 
     Args:
-        log: The log that was executed again.
+        log: The log that was re-executed.
         request: Executed sites and changed settings of the rerun.
         execution: The rerun, after its last tick.
         name: Name of the executed site.
@@ -238,16 +233,15 @@ def _compare_site_rerun(
 def _pair_records(
     log: Log, request: RerunRequest, name: str, executed: Sequence[RerunTick]
 ) -> _CommonRecords:
-    """Pairs the records of a site in a log with those of its rerun, to compare them.
+    """Pairs the records of a site in a log with those of its rerun, for comparison.
 
-    A rerun executes the log again, possibly with another tick rate. Records with the same time
-    form a pair.
+    Records with the same time form a pair. The tick rates may differ.
 
     Args:
         log: The log.
-        request: Sites (arm controllers) and settings of the rerun.
+        request: Sites and settings of the rerun.
         name: Name of the site.
-        executed: Executed ticks (control periods) of the site.
+        executed: Executed ticks of the site.
     """
     log_records = log[name]
     rerun_records = SiteLog(
@@ -266,10 +260,10 @@ def _pair_records(
 
 
 def _compute_rms(values: Array) -> float:
-    """Returns the largest root mean square of any column of an array.
+    """Returns the root mean square of the column for which it is largest.
 
     Args:
-        values: Values, shape (K, n), with a column for each joint.
+        values: Values, shape (K, n), with one column per joint.
     """
     largest = _find_largest(values)
     if not 0.0 < largest < np.inf:
@@ -280,19 +274,19 @@ def _compute_rms(values: Array) -> float:
 
 
 def _find_largest(values: Array) -> float:
-    """Returns the largest absolute value."""
+    """Returns the largest absolute value in an array."""
     return float(np.abs(values).max())
 
 
 def _compare_links(
     log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[_LinkEffect]:
-    """Returns the differences of the delays on the network links to an arm in the repeated run.
+    """Compares the delays on the links to an arm between the log and its rerun.
 
     Args:
         log: The log.
         request: Sites and settings of the rerun.
-        records: Paired records (results of control periods) of the receiver.
+        records: Paired records of the receiver.
     """
     effects = []
     for peer in records.before.peers:
@@ -314,17 +308,18 @@ def _compare_links(
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and the result of executing some or all of its sites (arm controllers) again.
+    """A log and the result of re-executing some or all of its sites.
 
-    The function `rerun` creates it. It can be shown, written as a log of its own, or converted
-    to plain values.
+    Created by the function `rerun`. The result can be displayed, written as a log of its own,
+    or converted to plain values.
 
     Attributes:
-        before: The log that was executed again.
+        before: The log that was re-executed.
         request: Executed sites and changed settings.
-        ticks: Every tick (control period) of every executed site, in the order of execution.
-        sites: Effect on each executed site, by the name of the site.
-        links: Effect on each link that ends at an executed site, by the name of the link.
+        ticks: Every tick of every executed site, in order of execution.
+        sites: Mapping from the name of each executed site to the effect on it.
+        links: Mapping from the name of each link that ends at an executed site to the effect on
+            it.
     """
 
     before: Log
@@ -334,10 +329,9 @@ class Rerun(Result):
     links: dict[str, _LinkEffect]
 
     def headline(self) -> str:
-        """Returns one line for the user that describes the repeated run.
+        """Returns a one-line description of the rerun for the user.
 
-        The line names the log, the way of execution, the sites (processes that each run one
-        arm) that were executed, and the settings that were changed.
+        It names the log, the kind of rerun, the executed sites and the changed settings.
         """
         changes = "; ".join(self.request.describe_changes()) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
@@ -345,10 +339,9 @@ class Rerun(Result):
 
     @cached_property
     def after(self) -> Log:
-        """The repeated run in the form of a log, so that it can be analysed like any log.
+        """The rerun as a log, which can be analysed like any other log.
 
-        Sites (arm controllers) that were executed appear as they were computed now, and other
-        sites as they were recorded.
+        Executed sites appear as newly computed, and all other sites as recorded.
         """
         stream = io.BytesIO()
         self.write(stream)
@@ -356,21 +349,21 @@ class Rerun(Result):
         return open_log(stream)
 
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
-        """Writes the rerun to a stream in the form of a log.
+        """Writes the rerun to a stream as a log.
 
-        Such a log can be read, displayed and checked like the log of a run. The records of
-        executed sites contain no measured values, such as computing times and round trips.
-        Recorded sites are copied byte for byte. The file states the SHA-256 hash of its source
-        log, the executed sites and the changes. Its scenario is that of the rerun.
+        The log can be read, displayed and checked like that of a run. The records of executed
+        sites contain no measured values, such as computing times and round trips. Recorded
+        sites are copied byte for byte. The file states the SHA-256 hash of its source log, the
+        executed sites and the changes. Its scenario is that of the rerun.
 
         Args:
             stream: Stream to which the log is written. It is not closed.
-            views_hz: Rate of the additional channels for viewers, in Hz, see
-                `offer_views`. 0 means none.
+            views_hz: Rate of the additional channels for viewers, in Hz, see `offer_views`. 0
+                means none.
 
         Raises:
-            LogError: The start time that the log states is not a time.
-            LogRefused: The disk refused to store the log.
+            LogError: The start time stated in the log is not a valid time.
+            LogRefused: Writing to the disk failed.
         """
         log = self.before
         request = self.request
@@ -403,7 +396,7 @@ class Rerun(Result):
         writer.finish(render_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the repeated run as a log to a file, which viewers can also display.
+        """Writes the rerun to a file as a log, including channels for viewers.
 
         Args:
             path: File to which the log is written.
@@ -411,14 +404,14 @@ class Rerun(Result):
 
         Raises:
             UsageError: The file exists, or cannot be created.
-            LogRefused: The disk refused to store the log.
+            LogRefused: Writing to the disk failed.
         """
         with LogFile(path, force=force) as stream:
             self.write(stream, VIZ_HZ)
 
     @property
     def diverged(self) -> bool:
-        """True if an arm left its limits in the repeated run, but not in the recorded run."""
+        """True if an arm left its limits in the rerun, but not in the recorded run."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -426,15 +419,15 @@ class Rerun(Result):
 
     @property
     def identical(self) -> bool:
-        """True if the repeated run gave the same bits in every record that was compared."""
+        """True if every compared record of the rerun is bit-identical to the log."""
         return all(effect.identical == effect.compared for effect in self.sites.values())
 
     @property
     def broken(self) -> bool:
-        """True if the rerun differs from the log although it should have the same bits.
+        """True if the rerun differs from the log although it should be bit-identical.
 
-        This indicates an error of the program or a damaged log. The bits should be the same
-        under three conditions:
+        This indicates a program error or a damaged log. The rerun should be bit-identical if
+        all of the following hold:
 
         - The log was written on this platform.
         - No setting was changed.
@@ -448,7 +441,7 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences for the user about the limits of a repeated run.
+        """Sentences for the user about the limitations of the rerun.
 
         For example, records may have been copied because the log was incomplete. Empty if there
         is nothing to mention.
@@ -456,17 +449,14 @@ class Rerun(Result):
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of differences between the repeated and the recorded run, for JSON.
+        """Returns a table of differences between the rerun and the recorded run, for JSON.
 
-        It has one row for each site (process that runs one arm) that was executed again.
+        The table has one row per re-executed site.
         """
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of a repeated run as plain values, ready for JSON.
-
-        The keys are those that `trilat rerun --json` prints.
-        """
+        """Converts the result to plain JSON values, with the keys of `trilat rerun --json`."""
         return {
             "log": self.before.source,
             "mode": self.request.mode,
@@ -490,7 +480,7 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Executes sites of a log again, usually with changed settings, and compares the results.
+    """Re-executes sites of a log, usually with changed settings, and compares the results.
 
     The corresponding command is `trilat rerun`.
 
@@ -504,13 +494,13 @@ def rerun(
             react.
         set: Changed settings of these sites, for example `{"control.Kd": 5}`.
         closed_loop: If True, all sites are executed, and `replace` must be empty.
-        progress: Function that is called now and then with the number of executed ticks, and an
-            upper bound on their total.
+        progress: Function that is called from time to time with the number of executed ticks,
+            and an upper bound on their total.
 
     Raises:
         LogError: The log cannot be read, or does not contain enough to execute the sites.
         UsageError: The sites are not named, or are named in two ways.
-        ScenarioError: There is no such site, or a change is not valid or cannot have an effect.
+        ScenarioError: There is no such site, or a change is invalid or cannot have an effect.
         CodeWithheld: The control law of an executed site is code that may not run.
     """
     before = log if isinstance(log, Log) else open_log(log)
@@ -534,7 +524,7 @@ def _parse_epoch(log: Log) -> int:
     """Returns the Unix time of the start of a log's session, in ns.
 
     Raises:
-        LogError: The text that the log states is not a time.
+        LogError: The time stated in the log is invalid.
     """
     text = log.session.get("epoch_unix_ns", "0")
     if not text.isdecimal() or int(text) > MAX_TIME_NS:
@@ -543,14 +533,14 @@ def _parse_epoch(log: Log) -> int:
 
 
 def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
-    """Returns the metadata with which the log of a rerun states its origin.
+    """Returns the metadata that states the origin of a rerun in its log.
 
     Args:
-        log: The log that was executed again.
-        request: Executed sites (arm controllers) and changed settings of the rerun.
+        log: The log that was re-executed.
+        request: Executed sites and changed settings of the rerun.
 
     Returns:
-        Texts by key: the source log, the executed sites and the changes.
+        A mapping from key to string: the source log, the executed sites and the changes.
     """
     digests = {}
     for source in log.sources:
@@ -568,11 +558,10 @@ def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
 
 def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
-    """Yields the messages of a site that a rerun copies from the source log, by time.
+    """Yields the messages of a site that a rerun copies from the source log, in order of time.
 
-    A rerun executes some sites (arm controllers) of a log again. The log of the rerun also
-    contains the records (results of control periods), statistics and events of the sites that
-    were not executed.
+    The log of the rerun also contains the records, statistics and events of sites that were not
+    executed.
     """
     site_log = log[name]
     site_events = [event for event in log.events if event.member == name]
@@ -603,8 +592,8 @@ def _make_executed_entries(
 def _to_plain_value(value: Any) -> Any:
     """Converts a value to types that JSON can represent.
 
-    A named tuple becomes a dictionary. Infinite numbers and NaN become None, because JSON has
-    no such numbers.
+    A named tuple becomes a dictionary. Infinite values and NaN become None, since JSON cannot
+    represent them.
     """
     if hasattr(value, "_asdict"):
         return {key: _to_plain_value(item) for key, item in value._asdict().items()}
@@ -612,7 +601,7 @@ def _to_plain_value(value: Any) -> Any:
 
 
 def _describe_limits(result: Rerun) -> Iterator[str]:
-    """Yields sentences for the user about the limits of a repeated run.
+    """Yields sentences for the user about the limitations of a rerun.
 
     Args:
         result: The log and its rerun.
@@ -640,7 +629,7 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
         )
     if not log.complete:
         yield "the log is incomplete: it is executed up to its last record"
-    for law in find_user_laws(request.scenario):
+    for law in request.scenario.inspect_user_laws():
         if law.changed and any(site in request.replaced for site in law.sites):
             yield f"the law is executed as its file is now: {law}"
     yield from _describe_later_changes(result)
@@ -649,22 +638,19 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
 
 
 def _describe_site_limits(effect: _SiteEffect, absent_ticks: int) -> Iterator[str]:
-    """Yields sentences about missing data of the log that limit the rerun of one site.
+    """Yields sentences about missing data in the log that limit the rerun of one site.
 
-    A site is a process that runs one arm, a tick is a period of its control loop, and its
-    record in the log is the stored result. There is a sentence for each of these facts:
+    There is one sentence for each of the following that applies:
 
     - Ticks could not be executed because the log contains too little. The recorded results of
       these ticks were copied.
-    - Ticks have no record. They were executed with assumed arrivals of samples.
+    - Ticks have no record. They were executed with estimated arrivals of samples.
     - The site had left the live session for some ticks, which are executed nevertheless.
-    - Samples (states of other sites) arrived, but the log does not contain them. The ticks were
-      executed without these samples.
+    - Samples arrived that the log does not contain. The ticks were executed without them.
     - No tick could be executed.
 
     Args:
-        effect: Difference that the rerun makes to the site, with the numbers of these ticks and
-            samples.
+        effect: Effect of the rerun on the site, with the numbers of these ticks and samples.
         absent_ticks: Number of ticks that the site did not execute in the live session, because
             it had left.
     """
@@ -695,10 +681,10 @@ def _describe_site_limits(effect: _SiteEffect, absent_ticks: int) -> Iterator[st
 def _describe_later_changes(result: Rerun) -> Iterator[str]:
     """Yields sentences about settings of the rerun that were changed again during the run.
 
-    A link, or the dominance factors of a site (how strongly it follows each of its peers), can
-    change at certain times: by the timeline of the scenario, or by commands that the log
-    contains. The rerun repeats these changes. A setting that the user of the rerun changed
-    therefore applies only up to the first of them.
+    A link, or the dominance factors of a site, can change at certain times: through the
+    timeline of the scenario, or through commands stored in the log. The rerun repeats these
+    changes. A setting changed by the user of the rerun therefore applies only until the first
+    of them.
 
     Args:
         result: The log and its rerun.

@@ -1,14 +1,13 @@
-"""Contains the built-in control laws, one per file.
+"""The built-in control laws, one per file.
 
-A control law computes the torque of an arm from the motion of the arm and of the other arms. An
-author chooses a law by its name, for example `law = "four_channel"` in a scenario, the file
-that describes an experiment.
+A control law computes the torque of an arm from the motion of this arm and of the other arms. A
+scenario selects a law by name, for example `law = "four_channel"`.
 
 Invariant:
-    - File, class and name of a law correspond: `four_channel.py` holds `FourChannel`.
-    - A built-in law is written as a user writes one (docs/extend/own-controller.md). Its method
-      `torque` is compiled, so it loops over numbers and creates no lists.
-    - Other modules find the laws by listing this folder, see `scenario.laws`.
+    - The names of a law's file and class correspond: `four_channel.py` contains `FourChannel`.
+    - A built-in law is written in the same way as a user's law (docs/extend/own-controller.md).
+      Its method `torque` is compiled, so it uses loops over numbers and creates no lists.
+    - Other modules find the laws by listing this folder (see `scenario.laws`).
 """
 
 from typing import TYPE_CHECKING

@@ -1,21 +1,21 @@
-"""Implements the adaptive control law, which learns the parameters of the arm's dynamics.
+"""The adaptive control law, which learns the dynamic parameters of the arm.
 
-The law is stated by Eq. (13) and (15) of the paper "Adaptive Control of Dual User Teleoperation
-with Time Delay and Dynamic Uncertainty", on which this project is based. It needs no model of
-the arm. While it controls the arm, it estimates the dynamic parameters theta, which are
-combinations of masses, lengths and inertias:
+The law is given by Eq. (13) and (15) of the paper "Adaptive Control of Dual User Teleoperation
+with Time Delay and Dynamic Uncertainty", on which this project is based. No model of the arm is
+required: the law estimates the dynamic parameters theta (combinations of masses, lengths and
+inertias) while controlling the arm:
 
     torque = Y theta_hat - Kp r - Kd ed
     rate of theta_hat = -Gamma Y' r
 
-where q and qd are positions and velocities of the joints, e is the position minus its reference
+where q and qd are the joint positions and velocities, e is the position minus its reference
 (the weighted mean position of the other arms), ed its derivative, r = qd + Lambda e the
-filtered error, theta_hat the estimate, and Y the matrix for which Y theta is the torque of the
-arm's dynamics. Lambda, Kp, Kd and Gamma are gains; a prime denotes the transpose.
+filtered error, theta_hat the estimate, and Y the regressor (Y theta is the torque of the arm's
+dynamics). Lambda, Kp, Kd and Gamma are gains; a prime denotes the transpose.
 
 The compiled control loop computes this law (`core.step.control.adaptive_torque` and
-`update_estimate`). `Adaptive` states the same law in plain Python, and
-`tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
+`update_estimate`). `Adaptive` implements the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same results.
 """
 
 from collections.abc import Mapping
@@ -37,10 +37,10 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlL
 class Adaptive(ControlLaw):
     """Adaptive law of the paper, which learns the dynamics of its arm, Eq. (13) and (15).
 
-    The loop is stable for any constant delays without external torque, if the dominance matrix
-    is irreducible and the matrices Kd of all sites differ by scalar factors only (the paper's
-    theorem, with the weights of docs/theory/errata-proof.md). This condition is sufficient and
-    does not cover delays that vary.
+    In the absence of external torques, the loop is stable for any constant delays if the
+    dominance matrix is irreducible and the matrices Kd of all sites differ only by scalar
+    factors (the paper's theorem, with the weights of docs/theory/errata-proof.md). The
+    condition is sufficient, and does not cover varying delays.
 
     With Gamma = 0 and theta_hat0 = theta, this is the law with known parameters. Kd = 0 removes
     the damping of the error.
@@ -50,7 +50,7 @@ class Adaptive(ControlLaw):
         Kp: Damping of r = qd + Lambda e, per joint, N m s/rad.
         Kd: Damping of the error's velocity, per joint, N m s/rad.
         Gamma: Adaptation gain per parameter.
-        theta_hat0: First estimate of theta, Eq. (24).
+        theta_hat0: Initial estimate of theta, Eq. (24).
     """
 
     Lambda: PositiveCoordinates = (1.0,)
@@ -69,7 +69,7 @@ class Adaptive(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate"
 
     def compute_torque(self, Y: Array, theta_hat: Array, r: Array, ed: Array) -> Array:
-        """Returns the torque of each joint before the torque limits, N m, Eq. (13).
+        """Returns the torque of each joint before limiting, N m, Eq. (13).
 
             tau = Y(q, qd, -Lambda e, -Lambda ed) theta_hat - Kp r - Kd ed
 
@@ -77,7 +77,7 @@ class Adaptive(ControlLaw):
         law.
 
         Args:
-            Y: Regressor of Eq. (12), shape (n, P). Multiplied by parameters, it gives a torque.
+            Y: Regressor of Eq. (12), shape (n, P).
             theta_hat: Estimate of the parameters, shape (P,).
             r: Filtered error qd + Lambda e, Eq. (10), shape (n,), rad/s.
             ed: Derivative of the error, shape (n,), rad/s.
@@ -91,17 +91,18 @@ class Adaptive(ControlLaw):
         return model_torque - (Kp * r + Kd * ed)
 
     def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
-        """Returns the estimate of the arm's parameters after a step, Eq. (15).
+        """Returns the estimate of the arm's parameters after one time step, Eq. (15).
 
         The continuous law is theta_hat' = -Gamma Y' r, where Y is the regressor, r the filtered
-        error and Gamma the adaptation gain. The step is
+        error and Gamma the adaptation gain. The discrete step is
 
             theta_hat - gain_s Gamma Y' r
 
         Args:
             theta_hat: Estimate before the step, shape (P,).
-            Yr: Product Y' r, shape (P,); the trapezoid rule passes the sum of two ticks.
-            gain_s: Duration of the step, s; the trapezoid rule passes half of the period.
+            Yr: Product Y' r, shape (P,). For the trapezoid rule, the sum over two ticks.
+            gain_s: Duration of the step, s. For the trapezoid rule, half of the control
+                period.
         """
         return theta_hat - gain_s * np.array(self.Gamma) * Yr
 
@@ -109,8 +110,7 @@ class Adaptive(ControlLaw):
         """Converts the gains of this law to the form that the compiled control loop reads.
 
         Args:
-            theta: True parameters of the arm. This law does not use them, because it learns
-                them.
+            theta: True parameters of the arm, unused because this law learns them.
         """
         return Gains(
             law=Law.ADAPTIVE,
@@ -124,22 +124,20 @@ class Adaptive(ControlLaw):
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.
 
-        This requires that the adaptation gain Gamma is zero, so that the law learns nothing.
-        Stability conditions of laws of this kind need reversible dominance factors, the weights
-        alpha_ij with which site i follows site j: positive weights D_i must exist with D_i
-        alpha_ij = D_j alpha_ji.
+        This is the case if the adaptation gain Gamma is zero, so that nothing is learnt.
+        Stability conditions for laws of this kind require reversible dominance factors
+        alpha_ij: there must be positive weights D_i with D_i alpha_ij = D_j alpha_ji.
         """
         return not any(self.Gamma)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        They are the table [control] of a scenario file: the tuned gains and the first estimate
-        of the arm's parameters.
+        The table contains the tuned gains and the initial estimate of the arm's parameters.
 
         Args:
-            gains: The tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {**gains, "theta_hat0": site.estimate}

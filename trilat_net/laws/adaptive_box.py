@@ -1,14 +1,14 @@
-"""Implements the adaptive law with bounds: each estimated parameter is kept in an interval.
+"""The adaptive law with bounds, which keep each estimated parameter within an interval.
 
 The adaptive law estimates the dynamic parameters theta of its arm, such as masses and inertias.
 Without bounds, an estimate may drift as long as the errors are not zero. With this law, the
-user states a lowest and a highest value for each parameter (together a box), and a projection
-keeps the estimate between them. The torque is computed as in `Adaptive`, by Eq. (13) of the
+user specifies a lower and an upper bound for each parameter (together a box), and a projection
+keeps the estimate within them. The torque is computed as in `Adaptive`, by Eq. (13) of the
 paper.
 
 The compiled control loop computes this law (`core.step.control.project_estimate`).
-`AdaptiveBox.advance_estimate` states the projection in plain Python, and
-`tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
+`AdaptiveBox.advance_estimate` implements the projection in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same results.
 """
 
 from collections.abc import Mapping
@@ -24,19 +24,19 @@ from .interface import TuningSite
 
 
 class AdaptiveBox(Adaptive):
-    """Adaptive law that keeps the estimate of each parameter of the arm between two bounds.
+    """Adaptive law that keeps each parameter estimate between a lower and an upper bound.
 
-    The law is `Adaptive` with a projection of the estimates. If the true parameters lie within
-    the bounds, or on them, the projection preserves the stability proof: the energy function V
-    of the proof still never increases (V' <= 0).
+    This is `Adaptive` with a projection of the estimates. If the true parameters lie within or
+    on the bounds, the projection preserves the stability proof: the energy function V of the
+    proof never increases (V' <= 0).
 
     Without bounds, an estimate that learns gravity acts like a spring that pulls the arms back
-    to a pose. If the true parameters lie strictly between the bounds, this effect disappears.
+    to a pose. This effect disappears if the true parameters lie strictly between the bounds.
 
     Source: Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4, for the projection.
 
     Attributes:
-        Lambda, Kp, Kd, Gamma, theta_hat0: Gains and first estimate, as in `Adaptive`.
+        Lambda, Kp, Kd, Gamma, theta_hat0: Gains and initial estimate, as in `Adaptive`.
         theta_low: Lower bound of each estimate.
         theta_high: Upper bound of each estimate.
     """
@@ -47,7 +47,7 @@ class AdaptiveBox(Adaptive):
     known_facts: ClassVar = "gravity, as its first estimate; the box is around it"
 
     def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
-        """Returns the estimate after a step of Eq. (15), limited to its bounds.
+        """Returns the estimate after one time step of Eq. (15), clipped to its bounds.
 
             min(max(theta_hat - gain_s Gamma Y' r, theta_low), theta_high)
 
@@ -63,24 +63,23 @@ class AdaptiveBox(Adaptive):
         return np.minimum(above_low, self.theta_high)
 
     def gains(self, theta: Array) -> Gains:
-        """Converts gains and bounds of this law to the form that the control loop reads.
+        """Converts the gains and bounds of this law to the form that the control loop reads.
 
         Args:
-            theta: True parameters of the arm. This law does not use them, because it learns
-                them.
+            theta: True parameters of the arm, unused because this law learns them.
         """
         gains = Adaptive.gains(self, theta)
         return gains._replace(low=self.theta_low, high=self.theta_high)
 
     def check(self, path: str, sites: int) -> None:  # noqa: ARG002 - used by other laws
-        """Rejects settings of the law that contradict each other.
+        """Raises ScenarioError if settings of the law contradict each other.
 
-        A lower bound must not exceed its upper bound, and the first estimate must lie within
+        A lower bound must not exceed its upper bound, and the initial estimate must lie within
         the bounds.
 
         Args:
-            path: Path of the law's table in the scenario, for errors.
-            sites: Number of sites, which this law does not use.
+            path: Path of the law's table in the scenario, for error messages.
+            sites: Number of sites, unused by this law.
 
         Raises:
             ScenarioError: A bound or an estimate is invalid. The error names the key.
@@ -97,14 +96,13 @@ class AdaptiveBox(Adaptive):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
-        They contain the tuned gains, the estimate of the arm's parameters with which the law
-        starts, and the bounds within which the estimate must stay.
+        The table contains the tuned gains, the initial estimate of the arm's parameters, and
+        the bounds of the estimate.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         control = Adaptive.write_control(gains, site)

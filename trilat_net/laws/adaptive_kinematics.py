@@ -1,7 +1,7 @@
-"""Controls end-effector positions of planar arms with unknown masses and link lengths.
+"""Control law for end-effector positions of planar arms with unknown masses and lengths.
 
-The law learns the dynamic parameters theta of an arm and the two lengths l of its links. It
-measures the position x and the velocity xd of the end effector.
+The law learns the dynamic parameters theta of an arm and its two link lengths l. It uses
+measurements of the position x and the velocity xd of the end effector.
 
 Equations:
 
@@ -13,8 +13,7 @@ Equations:
     rate of l_hat     = Gamma_l Y_k^T Kd ed
 
 Symbols:
-    - x_j: position of peer j (another arm); alpha_ij: weight with which this arm follows it; T:
-      delay of the connection.
+    - x_j: position of peer j; alpha_ij: weight that this arm gives to it; T: delay of the link.
     - q, qd: joint angles and velocities; tau: joint torques.
     - e: position error; v: reference velocity of the joints; r: filtered error.
     - theta_hat, l_hat: estimates of theta and l; J_hat: Jacobian computed from l_hat.
@@ -22,16 +21,16 @@ Symbols:
     - Y_k: matrix with Y_k l_hat = J_hat qd.
     - Lambda, Kp, Kd, Gamma, Gamma_l: gains.
 
-The functional V of the law `adaptive` does not rise, because the adaptation of l_hat cancels
-the term that wrong lengths add. The last step of the proof for `adaptive` does not apply to
-this law. docs/theory/laws-lengths.md proves instead that e and qd go to zero, because an end
-effector of finite reach cannot move at a constant velocity for ever. Source of the adaptive
+The functional V of the law `adaptive` never increases, because the adaptation of l_hat cancels
+the term introduced by wrong lengths. The last step of the proof for `adaptive` does not apply
+here. Instead, docs/theory/laws-lengths.md proves that e and qd converge to zero, because an end
+effector with finite reach cannot move at a constant velocity forever. Source of the adaptive
 Jacobian: Cheah, Liu and Slotine, Int. J. Robotics Research 25 (2006).
 
 Invariant:
-    - Both estimates are integrated by the trapezoid rule, like the estimate of `adaptive`.
-    - The estimated lengths stay between their bounds. The limitation to the bounds does not
-      impair the stability proof.
+    - Both estimates are integrated with the trapezoid rule, like the estimate of `adaptive`.
+    - The estimated lengths are clipped to their bounds, which does not affect the stability
+      proof.
 """
 
 from collections.abc import Mapping
@@ -45,15 +44,17 @@ from .conditions import LawSituation, StabilityCondition
 from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlLaw, TuningSite
 
 LEAST_SINE = 0.1
-"""Smallest abs(sin q2) with which J_hat is inverted; a more stretched elbow uses this value."""
+"""Lower bound of abs(sin q2) used when inverting J_hat; replaces smaller values near a
+stretched elbow.
+"""
 
 
 @leaf
 def _solve_jacobian(lengths: Pair, q: Pair, b: Pair) -> Pair:
-    """Returns the joint rates that move the end effector of the planar arm at a given velocity.
+    """Returns the joint rates for a given velocity of the planar arm's end effector.
 
-    The rates solve J rates = b, where J is the Jacobian of the end effector. A stretched elbow
-    makes J singular. In this case, the sine of the elbow's angle is replaced by `LEAST_SINE`.
+    The rates solve J rates = b, where J is the Jacobian of the end effector. J is singular for
+    a stretched elbow; near this pose, the sine of the elbow angle is replaced by `LEAST_SINE`.
 
     Args:
         lengths: Lengths of the two links, m.
@@ -110,8 +111,8 @@ def _jacobian_rate_times(
 ) -> Pair:
     """Returns the product of the Jacobian's time derivative and the joint velocities v.
 
-    This is the part of the end effector's acceleration that remains if v is constant. The
-    Jacobian also changes because the estimates of the link lengths change.
+    This is the acceleration of the end effector for constant v. The Jacobian also changes
+    because the estimated link lengths change.
 
     Args:
         lengths: Estimated lengths of the links, m.
@@ -141,8 +142,8 @@ def _jacobian_rate_times(
 class AdaptiveKinematics(ControlLaw):
     """The paper's law for end-effector positions of planar arms with unknown lengths.
 
-    The position and the velocity of each end effector are measured, and compared in a frame
-    that all bases share. Masses and lengths are learnt.
+    The positions and velocities of the end effectors are measured and compared in a common
+    frame. Masses and lengths are learnt.
 
     Source: C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive tracking control for robots with
     unknown kinematic and dynamic properties", Int. J. Robotics Research 25(3), 283-296, 2006.
@@ -152,9 +153,9 @@ class AdaptiveKinematics(ControlLaw):
         Kp: Damping of r, per joint, N m s/rad.
         Kd: Damping of the error's velocity, per coordinate, N s/m.
         Gamma: Adaptation gain per parameter.
-        theta_hat0: First estimate of theta, Eq. (24).
+        theta_hat0: Initial estimate of theta, Eq. (24).
         length_gain_m_n: Adaptation gain of the lengths, m/N.
-        lengths0_m: First estimate of the two lengths.
+        lengths0_m: Initial estimate of the two lengths, m.
         least_m: Lower bound of both lengths, m.
         most_m: Upper bound of both lengths, m.
     """
@@ -185,10 +186,10 @@ class AdaptiveKinematics(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate, and no length"
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law of a site before a run: creates its estimates and their last rates.
+        """Prepares the law of a site before a run, initialising its estimates and their rates.
 
-        The law estimates the lengths of the two links and the dynamic parameters of the arm.
-        Both estimates start at the values that the settings state.
+        The link lengths and the dynamic parameters of the arm are estimated. Their initial
+        values are taken from the settings.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -202,22 +203,21 @@ class AdaptiveKinematics(ControlLaw):
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
-        """Computes the joint torques of one control period, and updates the estimates.
+        """Computes the joint torques of one tick, and updates the estimates.
 
-        The law estimates the lengths of the links and the dynamic parameters of the arm. The
-        steps are:
+        The link lengths and the dynamic parameters of the arm are estimated. The steps are:
 
         1. Measure the position and velocity of the end effector, and send them to the other
            sites.
         2. Compute the error from the weighted mean position of the other end effectors.
         3. Update the estimate of the link lengths.
-        4. Compute the reference velocity of the joints and the filtered error.
+        4. Compute the joint reference velocity and the filtered error.
         5. Compute the torque, and update the estimate of the dynamic parameters.
 
-        The module docstring gives the equations.
+        See the module docstring for the equations.
 
         Args:
-            now: Inputs and outputs of the law in this period. The torque is written into
+            now: Inputs and outputs of the law in this tick. The torque is written into
                 `now.tau`.
         """
         q = (now.q[0], now.q[1])
@@ -314,18 +314,18 @@ class AdaptiveKinematics(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether this control law is proved to be stable in an experiment.
+        """Returns the conditions under which this law is proved to be stable in an experiment.
 
-        The proof in docs/theory/laws-lengths.md that the errors e and the velocities qd go to
-        zero requires that all delays are constant, that each arm follows every other arm,
-        directly or through others (irreducible matrix of weights), that the elbows stay bent,
-        and that the true lengths of the links lie between the bounds `least_m` and `most_m`.
+        docs/theory/laws-lengths.md proves that the errors e and the velocities qd converge to
+        zero. The proof requires constant delays, an irreducible matrix of weights (each arm
+        follows every other arm, directly or through others), elbows that stay bent, and true
+        link lengths between the bounds `least_m` and `most_m`.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
-            The condition as a string. It is never decided (`holds` is None), because only a run
+            The condition, as text. It is never decided (`holds` is None), because only a run
             shows whether the elbows stay bent.
         """
         if np.isnan(situation.longest_s):
@@ -341,14 +341,13 @@ class AdaptiveKinematics(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
-        They contain the tuned gains and the first estimate of the arm's dynamic parameters. The
-        first estimate of the link lengths keeps its default value.
+        The table contains the tuned gains and the initial estimate of the arm's dynamic
+        parameters. The initial estimate of the link lengths keeps its default value.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {**gains, "theta_hat0": site.estimate}

@@ -1,11 +1,11 @@
-"""Implements the bounded adaptive law with an additional torque against unknown disturbances.
+"""The bounded adaptive law with an additional torque that opposes unknown disturbances.
 
 The law estimates the dynamic parameters of its arm within a box, as `AdaptiveBox` does. The
-additional torque opposes torques that no value of these parameters explains, such as friction
-or the torque of an operator. It never exceeds a bound that the user states.
+additional torque counteracts disturbances that no choice of these parameters explains, such as
+friction or the torque of an operator. It never exceeds a bound specified by the user.
 
 The compiled control loop computes this law (`core.step.control.robust_torque`).
-`AdaptiveRobust.compute_torque` states the same law in plain Python, and
+`AdaptiveRobust.compute_torque` implements the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -24,11 +24,11 @@ from .interface import TuningSite
 class AdaptiveRobust(AdaptiveBox):
     """Adaptive law with bounded estimates and a robust term -rho r / sqrt(r^2 + width^2).
 
-    Here r is the filtered tracking error. Premises: constant delays, no operators, parameters
-    within their bounds, and a disturbance of at most rho at each joint. Then the mean over time
-    of the power that V, the energy function of the stability proof, dissipates is at most
-    0.3003 sum_i beta_i sum rho width, and no stronger statement is proved;
-    docs/reference/laws-adaptive.md derives the bound.
+    Here r is the filtered tracking error. The stability result assumes constant delays, no
+    operators, parameters within their bounds, and a disturbance of at most rho at each joint.
+    Under these premises, the time average of the power dissipated from V (the energy function
+    of the stability proof) is at most 0.3003 sum_i beta_i sum rho width. No stronger statement
+    is proved. The bound is derived in docs/reference/laws-adaptive.md.
 
     Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 
@@ -36,7 +36,7 @@ class AdaptiveRobust(AdaptiveBox):
         Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: As in `AdaptiveBox`.
         rho_nm: Bound on the disturbance per joint, N m (N for a sliding joint).
         width_rad_s: Value of r at which the robust term is 0.71 rho, per joint, rad/s (m/s).
-        friction: Fraction of the joints' friction that the law compensates.
+        friction: Fraction of the joint friction that the law compensates for.
     """
 
     rho_nm: NotNegativeJoints = (1.0,)
@@ -53,17 +53,16 @@ class AdaptiveRobust(AdaptiveBox):
         ed: Array,
         joint_friction: Array | float = 0.0,
     ) -> Array:
-        """Computes the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before limiting, N m.
 
             tau = Y theta_hat - Kp r - Kd ed - (1 - friction) f(v) - rho r / sqrt(r^2 + width^2)
 
         Kp and Kd are damping gains in N m s/rad, and `friction` is the fraction of the friction
-        f(v) that the law compensates. The last term is the robust term. It opposes disturbances
-        of at most rho (N m) and is smooth for errors below `width` (rad/s).
+        f(v) that the law compensates for. The last term, the robust term, counteracts
+        disturbances of up to rho (N m) and is smooth for errors below `width` (rad/s).
 
         Args:
             Y: Regressor of the arm's dynamics, shape (n, P), for n joints and P parameters.
-                Multiplied by the parameters, it gives a torque.
             theta_hat: Estimate of the parameters, shape (P,).
             r: Filtered error qd + Lambda e, shape (n,), rad/s. Here qd is the joint velocity, e
                 the position error and Lambda a gain in 1/s.
@@ -84,12 +83,11 @@ class AdaptiveRobust(AdaptiveBox):
     def gains(self, theta: Array) -> Gains:
         """Converts the gains of this law to the record that the compiled control loop reads.
 
-        The record contains the gains and bounds of `AdaptiveBox`, and the settings of the
-        robust term and of the friction.
+        The record contains the gains and bounds of `AdaptiveBox`, and the settings for the
+        robust term and friction compensation.
 
         Args:
-            theta: True parameters of the arm. This law does not use them, because it learns
-                them.
+            theta: True parameters of the arm, unused because this law learns them.
         """
         box = AdaptiveBox.gains(self, theta)
         return box._replace(
@@ -99,30 +97,29 @@ class AdaptiveRobust(AdaptiveBox):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
-        """States the bound on the errors that is proved for this law in a scenario.
+        """Returns the bound on the errors that is proved for this law in a scenario.
 
-        The errors do not converge to zero, because friction or an operator may disturb the arm
-        with up to `rho_nm` at each joint. Only a bound on their mean over time is proved. In V,
-        the energy function of the stability proof, site i (the process of one arm) dissipates a
-        power that consists of beta_i r' Kp r and a term for the disagreement of the sites. r is
-        the filtered error in rad/s, Kp a damping gain in N m s/rad, and beta_i the weight of
-        the site in V. The mean of this power is at most
+        The errors do not converge to zero, because friction or an operator may disturb each
+        joint with up to `rho_nm`. Only a bound on their time average is proved. In V, the
+        energy function of the stability proof, site i dissipates a power that consists of
+        beta_i r' Kp r and a term for the disagreement between the sites. r is the filtered
+        error in rad/s, Kp a damping gain in N m s/rad, and beta_i the weight of the site in V.
+        The mean of this power is at most
 
             beta_i ROBUST_RESIDUE sum rho width    in W, summed over the joints of the site.
 
         The factor `ROBUST_RESIDUE` (0.3003) bounds the power that the smooth robust term does
-        not cancel. At each joint, rho is the largest disturbance in N m, and width the value of
-        r in rad/s at which the robust term opposes it with 0.71 rho.
+        not cancel. For each joint, rho is the largest disturbance in N m, and width the value
+        of r in rad/s at which the robust term reaches 0.71 rho.
 
-        The proof assumes that all delays are constant, and that the true parameters theta of
-        the arm are within the box, the bounds in which the law searches for them.
+        The proof assumes that all delays are constant and that the true parameters theta of the
+        arm lie within the bounds of the estimate.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
-            The bound as a string. It holds if all delays are constant, and is undecided
-            otherwise.
+            The bound, as text. It holds if all delays are constant, and is undecided otherwise.
         """
         pairs = zip(self.rho_nm, self.width_rad_s, strict=True)
         bounds_per_joint = [rho * width for rho, width in pairs]
@@ -139,15 +136,14 @@ class AdaptiveRobust(AdaptiveBox):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
-        The robust term -rho r / sqrt(r^2 + width^2) of this law acts like a damping rho / width
-        while the filtered error r is small, where rho (N m) is the largest disturbance. This
-        function chooses the width (rad/s) so that this damping is a tenth of the gain Kp.
+        While the filtered error r is small, the robust term -rho r / sqrt(r^2 + width^2) acts
+        like a damping rho / width, where rho (N m) is the largest disturbance. The width
+        (rad/s) is chosen such that this damping is a tenth of the gain Kp.
 
         Args:
-            gains: Tuned gains by name, with rho as `rho_nm`.
+            gains: Mapping from gain name to tuned value, with rho as `rho_nm`.
             site: Facts about the arm for which the table is written.
         """
         width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]

@@ -1,15 +1,15 @@
-"""Shares the authority over one slave arm between two users.
+"""Control law that divides the authority over one slave arm between two users.
 
-A user is a person at a master arm, and the slave is the arm that follows both. Each user feels
-the other user, but not the force of the environment on the slave:
+A user is a person at a master arm, and the slave follows both masters. Each user feels the
+other user, but not the force that the environment exerts on the slave:
 
     slave    tau = G + K (sum_j alpha_j q_j - q) - d qd
     user i   tau = G + K alpha_ij (q_j - q_i) - d qd_i,    j: the other user
 
 where tau is the torque of an arm, G its gravity torque, q its position, K a stiffness, d a
-damping, and alpha_j are the dominance factors, the weights with which an arm follows the
-others. A user i with the share a of the authority has alpha_ij = 1 - a, so the user with less
-authority is guided more. A user's torque does not depend on the slave.
+damping, and alpha_j are the dominance factors. A user i whose share of the authority is a has
+alpha_ij = 1 - a, so the user with less authority is guided more strongly. A user's torque does
+not depend on the slave.
 """
 
 from collections.abc import Mapping
@@ -30,10 +30,11 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 @compiled
 class Authority(ControlLaw):
-    """Lets two users at master arms share the authority over one slave arm.
+    """Control law with which two users at master arms share the authority over one slave arm.
 
-    Each user feels the motion of the other user, but not the force of the environment on the
-    slave. A spring couples each arm to the arms of the users, and a damper brakes it.
+    A spring couples each arm to the arms of the users, and a damper brakes the arm. Each user
+    feels the motion of the other user, but not the force that the environment exerts on the
+    slave.
 
     Source: Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface
     design for minimally invasive telesurgical training", IEEE T-CST, 2005.
@@ -41,8 +42,8 @@ class Authority(ControlLaw):
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping of the arm's velocity, per joint, N m s/rad.
-        leads: True if the other arms follow this arm: for a user, but not for the slave.
-        gravity: Ratio of the compensated gravity torque to the true gravity torque. 1 is exact.
+        leads: True if the other arms follow this arm: true for a user, false for the slave.
+        gravity: Ratio of the compensated to the true gravity torque. 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -55,14 +56,14 @@ class Authority(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of the arm in one period of the control loop.
+        """Computes the torque of the arm in one tick.
 
-        Springs pull the arm towards the arms of the users. Each site, the process that runs one
-        arm, sends the flag `leads`, which is 1 for a user and 0 for the slave. A spring acts
-        only towards sites whose flag is 1.
+        Springs pull the arm towards the arms of the users. Each site sends the flag `leads`,
+        which is 1 for a user and 0 for the slave, and springs act only towards sites whose flag
+        is 1.
 
         Args:
-            now: Inputs and outputs of the law in this period. The torque is written into
+            now: Inputs and outputs of the law in this tick. The torque is written into
                 `now.tau`.
         """
         now.to_all.leads[0] = 1.0 if self.leads else 0.0
@@ -87,14 +88,13 @@ class Authority(ControlLaw):
 
             tau = G - d qd + K sum_j alpha_j leads_j (q_j - q)
 
-        The gains describe the first two terms, which have the form of a law that the analysis
-        knows (`Law.KNOWN`): G is the compensating gravity torque, d the damping in N m s/rad
-        and qd the joint velocity. The springs in the sum are not of that form. Therefore they
-        are left out here, and `linear_form` adds them.
+        The gains describe the first two terms, which have the form of a law known to the
+        analysis (`Law.KNOWN`): G is the gravity compensation, d the damping in N m s/rad and qd
+        the joint velocity. The springs in the sum do not have that form, and are added by
+        `linear_form`.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque
         # by `gravity`, the ratio of the compensated gravity torque to the true one.
@@ -104,21 +104,19 @@ class Authority(ControlLaw):
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the springs of this law as blocks of the linear analysis.
 
-        The linear analysis considers small motions around a pose at rest. Each spring pulls the
-        arm towards the arm of a user:
+        Each spring pulls the arm towards the arm of a user:
 
             tau = K sum_j alpha_j leads_j (q_j - q)
 
-        tau is the torque, q the position of the arm, q_j the position that peer j sends, and
-        alpha_j the weight with which this arm follows peer j. leads_j is 1 if peer j is a user
-        and 0 otherwise.
+        tau is the torque, q the position of the arm, q_j the position sent by peer j, and
+        alpha_j its dominance factor. leads_j is 1 if peer j is a user and 0 otherwise.
 
-        A block `form.add(row, column, gain)` says that the row contains gain times the column.
-        The row "tau" is the torque, the column "q" the position, the column ("from", j) the
-        vector that peer j sends, and the row ("to", j) the vector that is sent to peer j.
+        A block `form.add(row, column, gain)` adds gain times the column to the row. The row
+        "tau" is the torque, the column "q" the position, the column ("from", j) the vector sent
+        by peer j, and the row ("to", j) the vector sent to peer j.
 
         Args:
-            situation: This arm, its peers (the other arms) and their laws.
+            situation: This arm, its peers and their laws.
         """
         joints = len(situation.inertia)
         form = LinearForm(joints)
@@ -137,9 +135,8 @@ class Authority(ControlLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:
         """Explains to the user which dominance factors of a user's arm have no effect.
 
-        A dominance factor is the weight with which an arm follows another arm. With this law,
-        the arms of the users follow only each other. The weight that a scenario gives to the
-        slave is not used.
+        With this law, the users' arms follow only each other, so the weight that a scenario
+        assigns to the slave is not used.
 
         Args:
             situation: This arm, and the laws of all arms.
@@ -156,18 +153,18 @@ class Authority(ControlLaw):
         return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
+        """Returns the gains and delays for which this law is stable at one arm of a scenario.
 
-        For the arm of a user, the loop is a spring with a damper between the two users, whose
-        known condition is used. The slave follows the users, but no arm follows the slave. It
-        closes no loop and is stable for every delay.
+        The loop between the two users consists of a spring and a damper, for which a condition
+        is known. No arm follows the slave, so the slave closes no loop and is stable for any
+        delay.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
-            The condition. None if the law does not compensate gravity exactly, because then no
-            condition is known.
+            The condition. None if gravity compensation is not exact, because no condition is
+            known for that case.
         """
         users = []
         for n, law in enumerate(situation.laws):
@@ -186,15 +183,13 @@ class Authority(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment. A
-        site is the process that runs one arm. At the masters, which are the arms of the two
-        users, `leads` is set to true, so that the other arms follow them. At the slave it is
-        false.
+        `leads` is true for the masters (the arms of the two users), which the other arms
+        follow, and false for the slave.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {**gains, "leads": site.role == "master", "gravity": site.gravity}

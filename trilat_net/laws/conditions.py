@@ -1,16 +1,18 @@
-"""Defines how a control law states when it is stable, and how it behaves for small motions.
+"""Describes the stability condition of a control law, and its behaviour for small motions.
 
-- The stability condition says for which gains and delays the law is stable. The commands
-  `trilat scenario check` and `trilat linear` print it.
-- The linear form describes the law near a pose at rest, as a matrix of blocks. Each block says
+- The stability condition states for which gains and delays the law is stable. It is printed by
+  the commands `trilat scenario check` and `trilat linear`.
+- The linear form describes the law near a resting pose as a matrix of blocks. Each block states
   how one quantity, for example the torque, depends on another, for example the position. The
   linear analysis combines the forms of all arms into one linear system with delays.
 
 Invariant:
     - Each law defines both as methods of its `Settings`, the record of its gains.
-    - The text of a condition says whether the condition is only sufficient, and who proved it.
-    - A spring and dampers of the usual form are not blocks: the method `linear_gains` returns
-      their gains. Blocks describe the remaining terms, for example internal states of a law.
+    - The text of a condition states whether the condition is only sufficient, and who proved
+      it.
+    - A spring and dampers of the usual form are not expressed as blocks. Their gains are
+      returned by the method `linear_gains`, and blocks describe only the remaining terms, for
+      example internal states of a law.
 """
 
 from collections.abc import Sequence
@@ -21,17 +23,17 @@ import numpy as np
 from ..core import Array, DominanceMatrix
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
-"""The premise of each law that balances energy, as part of a sentence."""
+"""Premise of every law with an energy account, as part of a sentence."""
 COMMON_MOTION_SHARE = 0.21723362821
-"""-min sin x / x: the ratio d / (K T) of damping to stiffness times delay that the common
-motion of all sites needs at its most critical mass.
+"""-min sin x / x: the ratio d / (K T) of damping to stiffness times delay required for the
+common motion of all sites at the most critical mass.
 """
 
 
 class ArmLoad(NamedTuple):
-    """Spring and damper by which a person or an object reacts to the motion of an arm.
+    """Spring and damper that model how a person or an object reacts to the motion of an arm.
 
-    A wall, for example, is a spring with a damper; a person's hand is modelled in the same way.
+    Both a wall and a person's hand are modelled in this way.
 
     Attributes:
         stiffness_nm_rad: Stiffness per joint, N m/rad.
@@ -43,29 +45,28 @@ class ArmLoad(NamedTuple):
 
 
 class LawSituation(NamedTuple):
-    """Facts for a stability condition: the laws, delays and weights of all arms.
+    """Facts needed to evaluate a stability condition: laws, delays and weights of all arms.
 
-    The weights state how much each arm follows the others. The process of an arm is called a
-    site.
+    The weights state how much each arm follows the others.
 
     Attributes:
         site: Index of the site.
         names: Names of the sites.
         laws: Settings of the control law of each site.
-        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
-            follows the other sites.
-        delay_s: Delay of the link from j to i, row i, column j, at least one tick (period of
-            the control loop), s; NaN if it varies.
+        alpha: Dominance matrix, shape (N, N). Row i contains the weights that site i gives to
+            the other sites.
+        delay_s: Delay of the link from j to i in row i and column j, at least one tick, s; NaN
+            if it varies.
         tau_limit_nm: Largest torques of the site's joints, N m.
         rate_hz: Tick rate of the site, Hz.
         gravity_nm: Largest gravity torque of the site's planar arm, N m per joint; () for a
             chain.
         hold_s: Duration for which a torque is held, s: one tick with the scheme `digital`, NaN
-            if sites have several rates, otherwise 0 as in continuous time.
+            if tick rates differ between sites, otherwise 0 as in continuous time.
         hands: For each site, the operators and environments that react to the motion of its
-            arm. None for a site if one of these reactions is not a spring and a damper per
+            arm. None for a site where one of these reactions is not a spring and a damper per
             joint. () if nothing is known about any site.
-        in_task_space: True if end effectors follow each other, instead of joints.
+        in_task_space: True if end effectors rather than joints follow each other.
     """
 
     site: int
@@ -84,20 +85,20 @@ class LawSituation(NamedTuple):
     def longest_s(self) -> float:
         """Longest delay of the links from the arms that this arm follows, s.
 
-        It is NaN if any of these delays varies.
+        NaN if any of these delays varies.
         """
         is_followed = self.alpha > 0.0
         delays_s = self.delay_s[is_followed]
         return float(np.max(delays_s, initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
-        """Returns the facts about the session as if only some of the arms (sites) took part.
+        """Returns the facts as if only some of the sites took part in the session.
 
-        A law that follows only some of the other arms evaluates its stability condition for
-        these arms alone.
+        Used by laws that follow only some of the other arms, and evaluate their stability
+        condition for these arms alone.
 
         Args:
-            sites: Indices of the sites that remain. The site of these facts must be among them.
+            sites: Indices of the sites to keep. The site of these facts must be among them.
         """
         submatrix = np.ix_(sites, sites)
         return self._replace(
@@ -110,26 +111,26 @@ class LawSituation(NamedTuple):
         )
 
     def judge_position_exchange(self, damping: str) -> "StabilityCondition | None":
-        """Evaluates whether arms that are coupled by springs and braked by dampers are stable.
+        """Evaluates whether arms coupled by springs and braked by dampers are stable.
 
-        The control law is called P+d. Its condition holds for arms of any mass. For two arms,
-        it is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two arms need the
-        same stiffness K, damping d and delay T at all arms, and reversible weights with which
-        they follow each other, see `DominanceMatrix.find_balancing_weights`
+        This control law is called P+d, and its condition holds for arms of any mass. For two
+        arms, the condition is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. For more
+        than two arms, the stiffness K, damping d and delay T must be the same at all arms, and
+        the dominance factors must be reversible, see `DominanceMatrix.find_balancing_weights`
         (docs/theory/damping-conditions.md, 13).
 
-        A torque that is held for the period h acts h / 2 later. Therefore d is reduced by
-        K h / 2 and T increased by h / 2, for arms whose least inertia is above d h / 2
+        Holding a torque for the period h delays it by h / 2 on average. Therefore d is reduced
+        by K h / 2 and T increased by h / 2, for arms whose smallest inertia exceeds d h / 2
         (docs/reference/laws-springs.md).
 
         Args:
-            damping: Name of the law's attribute with d.
+            damping: Name of the law's attribute that contains d.
 
         Returns:
-            The condition. It is undecided for delays that vary, for several tick rates, in task
-            space, if the sites have different laws or ratios Kd / K, and if another site does
-            not compensate gravity exactly. None if the law of this site does not compensate
-            gravity exactly, because then no condition is known.
+            The condition. It is undecided for varying delays, for differing tick rates, in task
+            space, if the sites have different laws or ratios Kd / K, and if gravity
+            compensation is not exact at another site. None if gravity compensation is not exact
+            at this site, because no condition is known for that case.
         """
         laws = self.laws
         gravity_factors = [getattr(law, "gravity", 1.0) for law in laws]
@@ -178,15 +179,15 @@ class LawSituation(NamedTuple):
 
 
 class StabilityCondition(NamedTuple):
-    """Answer to the question whether a control law is stable at one arm of an experiment.
+    """States whether, and under which condition, a control law is stable at one arm.
 
-    It states the condition, for example a lower bound on the damping, and whether it is met.
+    The condition is, for example, a lower bound on the damping.
 
     Attributes:
-        holds: True if the condition is met, False if not, None if it cannot be decided.
-        text: Sentence with the condition, its numbers, its premises, and whether it is
-            sufficient or sharp.
-        proves_decay: True if all motions die away where the condition holds. False if it only
+        holds: True if the condition is satisfied, False if not, None if it cannot be decided.
+        text: Sentence that states the condition with its numerical values and premises, and
+            whether it is sufficient or sharp.
+        proves_decay: True if the condition implies that all motions decay. False if it only
             proves that they stay bounded, or that the loop is passive.
     """
 
@@ -198,30 +199,30 @@ class StabilityCondition(NamedTuple):
 def _judge_two_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Evaluates the stability condition of two arms that are coupled by springs with dampers.
+    """Evaluates the stability condition of two arms coupled by springs and dampers.
 
     The condition is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009:
 
         4 d1 d2 >= (T1 + T2)^2 K1 K2
 
-    K1 and K2 are the stiffnesses of the two springs, d1 and d2 the dampings of the two arms.
-    T1 + T2 is the sum of the delays in both directions.
+    K1 and K2 are the stiffnesses of the two springs, d1 and d2 the dampings of the two arms,
+    and T1 + T2 the sum of the delays in both directions.
 
-    A torque that is held for the period h acts h / 2 later. Therefore each d is reduced by
-    K h / 2, and the sum of the delays is increased by h. Each stiffness is multiplied by the
-    weight with which its site follows the other. Both weights are 1 if a session has only two
-    sites; they can be less if the two sites are a part of a larger session.
+    Holding a torque for the period h delays it by h / 2 on average. Therefore each d is reduced
+    by K h / 2, and the sum of the delays is increased by h. Each stiffness is multiplied by the
+    weight that its site gives to the other site. Both weights are 1 in a session with two
+    sites, but may be smaller if the two sites are part of a larger session.
 
     Args:
         situation: The situation of the site, with the delays and the hold time h.
         K: Stiffness of each site per joint, N m/rad, shape (2, n), where n is the number of
             joints.
         d: Damping of each site per joint, N m s/rad, shape (2, n).
-        scope: Part of the text that says for which arms the condition is sufficient.
+        scope: Part of the text that states for which arms the condition is sufficient.
 
     Returns:
-        The condition with its numbers. It holds if it is met at every joint, and no damping is
-        negative after the reduction.
+        The condition with its numerical values. It holds if it is satisfied at every joint, and
+        no damping is negative after the reduction.
     """
     hold_s = situation.hold_s
     alpha = situation.alpha
@@ -252,24 +253,24 @@ def _judge_two_sites(
 def _judge_several_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Evaluates the damping that more than two arms need if delayed springs couple them.
+    """Evaluates the damping condition of more than two arms coupled by delayed springs.
 
         d > c K T
 
-    d is the damping, K the stiffness of the springs and T the delay. The factor c is the larger
-    of two numbers: the negative of the least eigenvalue of the dominance matrix, for motions in
-    which the arms differ, and the factor for the common motion of all arms
+    d is the damping, K the stiffness of the springs and T the delay. The factor c is the
+    maximum of two values: the negative of the smallest eigenvalue of the dominance matrix, for
+    motions in which the arms differ, and the factor for the common motion of all arms
     (`_find_common_motion_share`).
 
     Args:
         situation: The laws, delays and weights of all sites.
         K: Stiffness of each site per joint, shape (N, n), N m/rad.
         d: Damping of each site per joint, shape (N, n), N m s/rad.
-        scope: Part of the text that says for which arms the condition is sufficient.
+        scope: Part of the text that states for which arms the condition is sufficient.
 
     Returns:
-        The condition. It is undecided if the sites have different gains or delays, and not met
-        if the dominance matrix is not reversible.
+        The condition. It is undecided if the sites have different gains or delays, and not
+        satisfied if the dominance matrix is not reversible.
     """
     T = situation.longest_s
     hold_s = situation.hold_s
@@ -305,25 +306,25 @@ def _judge_several_sites(
 
 
 def _find_common_motion_share(count: float) -> float:
-    """Returns how much damping all sites need so that their common motion dies away.
+    """Returns the damping ratio required for the common motion of all sites to decay.
 
-    In the common motion, all arms move alike. Each is pulled by a spring with the stiffness K
-    towards the position that the others had before the delay T, and is braked by a damper d. If
-    the motion oscillates with the angular frequency w, the delayed spring acts like a damper
-    K sin(w T) / w, which is negative for w T between pi and 2 pi. In continuous time, d must
+    In the common motion, all arms move alike. A spring with the stiffness K pulls each arm
+    towards the position that the others had a delay T ago, and a damper d brakes it. If the
+    motion oscillates with the angular frequency w, the delayed spring acts like a damper K
+    sin(w T) / w, which is negative for w T between pi and 2 pi. In continuous time, d must
     therefore exceed the maximum of -K sin(w T) / w, so that
 
         d / (K T) = -min sin(x) / x,    x = w T    (the constant `COMMON_MOTION_SHARE`).
 
-    If torques are held for the period h, the delay is T + h / 2 = n h / 2 with
-    n = 2 T / h + 1. With x = w h / 2, the condition becomes
+    If torques are held for the period h, the delay is T + h / 2 = n h / 2 with n = 2 T / h + 1.
+    With x = w h / 2, the condition becomes
 
         (d - K h / 2) / (K (T + h / 2)) = -min sin(n x) / (n sin x),    n x from pi to 2 pi.
 
     The minimum is found on a grid of 1001 points, which is fine enough for a smooth function.
 
     Args:
-        count: The number n: the delay in halves of the period h.
+        count: The number n, the delay in units of h / 2.
 
     Returns:
         The ratio of damping to stiffness times delay, dimensionless.
@@ -336,7 +337,7 @@ def _find_common_motion_share(count: float) -> float:
 
 
 BlockKey = str | tuple[str, int]
-"""A row or a column of a linear form.
+"""Key of a row or a column of a linear form.
 
 Rows: "tau"; the name of a state, for its derivative; ("to", j) for the vector sent to peer j.
 Columns: "q", "qd", "q_des", "qd_des", a state, ("from", j) for the vector received from peer j,
@@ -345,16 +346,16 @@ and "tau_h" for the torque ON the arm.
 
 
 class LinearSituation(NamedTuple):
-    """Facts for the linearisation of a control law: laws and weights of all arms, and inertia.
+    """Facts needed to linearise a control law: laws and weights of all arms, and the inertia.
 
-    The linearised law describes small motions about a pose at rest.
+    The linearised law describes small motions about a resting pose.
 
     Attributes:
         site: Index of the site.
         names: Names of the sites.
         laws: Settings of the control law of each site.
-        alpha: Dominance matrix in force, shape (N, N): row i contains the weights with which
-            site i follows the other sites.
+        alpha: Dominance matrix in effect, shape (N, N). Row i contains the weights that site i
+            gives to the other sites.
         inertia: Inertia matrix M(q) of the site's arm, shape (n, n), kg m^2.
     """
 
@@ -366,25 +367,25 @@ class LinearSituation(NamedTuple):
 
     @property
     def peers(self) -> list[int]:
-        """Indices of all other arms in ascending order, whose motion the law may use."""
+        """Indices of all other arms, whose motion the law may use, in ascending order."""
         return [j for j in range(len(self.names)) if j != self.site]
 
 
 class LinearForm:
     """Behaviour of a control law for small motions of its arm, as a matrix of blocks.
 
-    For a site with n joints, each block is a matrix of n x n numbers. It says how a quantity
-    (the row) depends on another (the column): for example the block ("tau", "q") is the
-    derivative of the torque with respect to the position.
+    For a site with n joints, each block is an n x n matrix that states how one quantity (the
+    row) depends on another (the column). For example, the block ("tau", "q") is the derivative
+    of the torque with respect to the position.
 
     Args:
-        joints: n, the number of joints.
+        joints: Number n of joints.
         states: Names of the law's states.
-        sends_acceleration: True if the law sends the acceleration of its arm; then the rows
-            ("to", j) only name the receivers.
+        sends_acceleration: True if the law sends the acceleration of its arm. In that case, the
+            rows ("to", j) only identify the receivers.
 
     Attributes:
-        blocks: Blocks by row and column, shape (n, n) each. A block that is missing is zero.
+        blocks: Mapping from row and column to the block, shape (n, n). Missing blocks are zero.
     """
 
     def __init__(
@@ -398,12 +399,12 @@ class LinearForm:
     def add(self, row: BlockKey, column: BlockKey, gain: Any) -> None:
         """Adds a gain to one block of the matrix that describes a linearised control law.
 
-        A block that does not exist yet counts as zero.
+        A missing block is treated as zero.
 
         Args:
-            row: Row of the block, the quantity that depends on the other.
-            column: Column of the block, the quantity on which it depends.
-            gain: A number for all joints, a number per joint, or a matrix of shape (n, n).
+            row: Row of the block, the dependent quantity.
+            column: Column of the block, the quantity on which the row depends.
+            gain: A scalar for all joints, one value per joint, or a matrix of shape (n, n).
         """
         block = np.asarray(gain, dtype=np.float64)
         if block.ndim < 2:
@@ -412,10 +413,10 @@ class LinearForm:
         self.blocks[row, column] = previous + block
 
     def list_receivers(self) -> list[int]:
-        """Returns the other arms to which the law sends signals, such as waves, as indices.
+        """Returns the indices of the arms to which the law sends signals, in ascending order.
 
-        The linear analysis adds a variable for the signal to each of them. The indices are in
-        ascending order. The list is empty if the law exchanges only the motion.
+        The linear analysis adds a variable for each of these signals, for example a wave. The
+        list is empty if the law exchanges only the motion.
         """
         receivers = set()
         for row, _ in self.blocks:

@@ -1,21 +1,19 @@
-"""Implements the four-channel law: arms exchange positions and forces in both directions.
+"""The four-channel control law: arms exchange positions and forces in both directions.
 
-Each arm is pulled towards the positions of the other arms, its peers, and feels the torques
-that operators and environments exert on the peers. A user thus feels what the remote arm
-touches.
+Each arm is pulled towards the positions of its peers, and feels the torques that operators and
+environments exert on them. This lets a user feel what the remote arm touches.
 
-The positions and torques of the peers are averaged with the dominance factors, the weights with
-which an arm follows its peers. The averages are q_des (position), qd_des (velocity), qdd_des
-(acceleration) and `felt` (torque). The torque that an operator or environment exerts on the arm
-itself is tau_h.
+The positions and torques of the peers are averaged, weighted by the dominance factors. The
+averages are q_des (position), qd_des (velocity), qdd_des (acceleration) and `felt` (torque).
+The external torque on the arm itself, exerted by an operator or environment, is tau_h.
 
 Four gains weight the torques: `force_peer` and `force_own`, each at the master and at the
-slave. A gain of zero removes a channel. Lawrence, who introduced the law for two sites, uses
-the symbols C2 and C6 for them at the master, and C3 and C5 at the slave.
+slave. A gain of zero removes a channel. Lawrence, who introduced the law for two sites, calls
+these gains C2 and C6 at the master, and C3 and C5 at the slave.
 
 Invariant:
-    - The acceleration that a site sends is computed, not measured. It follows from the model of
-      the arm and the torques of the current period of the control loop.
+    - The acceleration that a site sends is not measured. It is computed from the arm model and
+      the torques of the current tick.
 """
 
 from typing import Any, ClassVar
@@ -43,13 +41,13 @@ _NEUTRAL = (
 def _send_acceleration(law: Any, now: LawInput) -> None:
     """Computes the acceleration of the arm from its torques, and sends it to the other arms.
 
-    The acceleration is not measured. It is the solution qdd of M qdd = tau - tau_x - bias, with
-    tau within its limits, where M is the inertia matrix, tau_x the exogenous torque and bias
-    the torque of gravity and of Coriolis forces. The method is Gaussian elimination.
+    The acceleration is not measured. It is the solution qdd of M qdd = tau - tau_x - bias,
+    computed by Gaussian elimination. M is the inertia matrix, tau the limited torque, tau_x the
+    external torque, and bias the torque due to gravity and Coriolis forces.
 
     Args:
-        law: The law, whose `rows` are the work space.
-        now: Inputs and outputs of the law in this tick (period of the control loop).
+        law: The law, whose `rows` serve as work space.
+        now: Inputs and outputs of the law in this tick.
     """
     n = now.joints
     rows = law.rows
@@ -94,7 +92,7 @@ class FourChannel(ControlLaw):
         tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des
               + force_peer felt + force_own tau_h
 
-    Without delay the coupling is ideally transparent if force_peer = 1 + force_own at both
+    Without delay, the coupling is ideally transparent if force_peer = 1 + force_own at both
     sites and acceleration = 1.
 
     Source: Lawrence, IEEE T-RA 9, 1993; local force feedback after Hashtrudi-Zaad and
@@ -105,8 +103,8 @@ class FourChannel(ControlLaw):
         B: Damping of the error, per joint, N m s/rad.
         force_peer: Gain of the peers' torque, C2 or C3, per joint, dimensionless.
         force_own: Gain of the torque on the arm itself, C6 or C5, per joint, dimensionless.
-        acceleration: Factor of the peers' acceleration that is fed forward.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        acceleration: Feedforward gain of the peers' acceleration, dimensionless.
+        gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
     K: PositiveJoints = (100.0,)
@@ -123,8 +121,8 @@ class FourChannel(ControlLaw):
     def begin(self, facts: LawContext) -> None:
         """Prepares the law before a run: stores the torque limits and allocates buffers.
 
-        If the law sends the acceleration of its arm, it computes the acceleration from the
-        equation of motion. This computation needs the limits and the buffers.
+        They are needed if the law sends the acceleration of its arm, which it computes from the
+        equation of motion.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -137,18 +135,17 @@ class FourChannel(ControlLaw):
         self.rows = [0.0] * (n * (n + 1))
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of the arm in one period of the control loop.
+        """Computes the torque of the arm in one tick.
 
             tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des
                   + force_peer felt + force_own tau_h
 
-        `FourChannel` explains the gains, and the module docstring explains the other symbols. G
-        is the gravity torque and M the inertia matrix. If the gain `acceleration` is not zero,
-        the method also sends the acceleration that the torque causes to the peers (the other
-        arms).
+        The gains are described in `FourChannel` and the other symbols in the module docstring.
+        G is the gravity torque and M the inertia matrix. If the gain `acceleration` is not
+        zero, the method also sends the peers the acceleration caused by the torque.
 
         Args:
-            now: Inputs and outputs of the law in this period. The torque is written into
+            now: Inputs and outputs of the law in this tick. The torque is written into
                 `now.tau`.
         """
         n = now.joints
@@ -178,14 +175,13 @@ class FourChannel(ControlLaw):
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the gains of spring, damper and felt torque for the linear analysis.
 
-        The gains are written for the built-in law tau = G - K e - Kd ed + k_f felt. Here G is
-        the gravity torque, e the position error, ed its derivative and `felt` the torque on the
-        arms of the peers. K, Kd and k_f are the gains `K`, `B` and `force_peer` of this law.
-        `linear_form` adds the remaining terms.
+        The gains refer to the built-in law tau = G - K e - Kd ed + k_f felt, where G is the
+        gravity torque, e the position error, ed its derivative and `felt` the torque on the
+        arms of the peers. The values of K, Kd and k_f are the gains `K`, `B` and `force_peer`
+        of this law. `linear_form` adds the remaining terms.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
@@ -199,25 +195,23 @@ class FourChannel(ControlLaw):
         )
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns two terms for the linear analysis that `linear_gains` cannot express.
+        """Returns the two terms of the linearised law that `linear_gains` cannot express.
 
-        `linear_gains` returns the gains of the gravity torque, the spring, the damper and the
-        torque on the peers (the other arms). The two remaining terms of the torque tau are
+        `linear_gains` covers the gravity torque, the spring, the damper and the torque on the
+        peers. The two remaining terms of the torque tau are
 
             force_own tau_h + acceleration M sum_j alpha_j qdd_j
 
-        tau_h is the torque that the operator or environment exerts on the arm itself, M the
-        inertia matrix of the arm, qdd_j the acceleration that peer j sends, and alpha_j the
-        weight with which this site (the process of the arm) follows peer j. `force_own` and
+        tau_h is the external torque on the arm itself, M the inertia matrix of the arm, qdd_j
+        the acceleration sent by peer j, and alpha_j its dominance factor. `force_own` and
         `acceleration` are gains.
 
-        A block `form.add(row, column, gain)` says that the row contains gain times the column.
-        The row "tau" is the torque, the column "tau_h" the torque on the arm, the column
-        ("from", j) the vector that peer j sends, and the row ("to", j) the vector that is sent
-        to peer j.
+        A block `form.add(row, column, gain)` adds gain times the column to the row. The row
+        "tau" is the torque, the column "tau_h" the torque on the arm, the column ("from", j)
+        the vector sent by peer j, and the row ("to", j) the vector sent to peer j.
 
         Args:
-            situation: The site, its arm, and the weights with which it follows its peers.
+            situation: The site, its arm and its dominance factors.
 
         Returns:
             Both terms. None if the gains `acceleration` and `force_own` are zero.
@@ -238,12 +232,12 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Evaluates the stability of this law in the cases that the gains alone decide.
+        """Evaluates the stability of this law where the gains alone determine the result.
 
         If the feedforward gain `acceleration` is 1, high frequencies are undamped, and the
-        condition is not met. In all other cases it is undecided (`holds` is None), because it
-        depends on the arms. The command `trilat ports` then evaluates Llewellyn's criterion for
-        absolute stability.
+        condition is not satisfied. In all other cases the condition depends on the arms and is
+        undecided (`holds` is None). For these, the command `trilat ports` evaluates Llewellyn's
+        criterion for absolute stability.
         """
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)

@@ -1,20 +1,20 @@
-"""Implements impedance control: each arm moves like a mass on a spring and a damper.
+"""Impedance control: each arm moves like a mass attached to a spring and a damper.
 
     impedance     M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j(t - T)
     inner loop    tau = M(q) qdd + C qd + G - tau_h
 
-In the first equation q, qd and qdd are position, velocity and acceleration of the joints. M, B
-and K are the inertia, damping and stiffness that the user chooses; q_ref and qd_ref are the
-reference and its velocity; tau_h is the torque of the operator or environment on the arm; f_j
-is the force that peer j sends, and T its delay. The inner loop computes the torque tau that
-gives the arm the acceleration qdd of this equation. It uses the arm's inertia matrix M(q),
-Coriolis matrix C and gravity torque G.
+In the first equation, q, qd and qdd are the position, velocity and acceleration of the joints;
+M, B and K are the inertia, damping and stiffness chosen by the user; q_ref and qd_ref are the
+reference and its velocity; tau_h is the torque that an operator or environment exerts on the
+arm; f_j is the force sent by peer j, and T its delay. The inner loop computes the torque tau
+that produces this acceleration qdd, using the arm's inertia matrix M(q), Coriolis matrix C and
+gravity torque G.
 
-A master is an arm that a person moves, and the slave follows the masters. The reference of a
-master is its start pose at rest. The reference of the slave is the pose of the masters,
-weighted by its dominance factors alpha_j (the weights with which it follows them). The slave
-sends f_j = alpha_j tau_h to master j, so each master feels the environment's force in
-proportion to its share of the lead. Masters send zeros.
+A master is an arm moved by a person, and the slave follows the masters. The reference of a
+master is its start pose, at rest. The reference of the slave is the average pose of the
+masters, weighted by the dominance factors alpha_j. The slave sends f_j = alpha_j tau_h to
+master j, so each master feels the force of the environment in proportion to its dominance
+factor. Masters send zeros.
 """
 
 import math
@@ -36,22 +36,23 @@ from .conditions import (
 from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningRun, TuningSite
 
 MOST_HANDS = 4
-"""Largest number of hands at the masters for which all combinations are tried."""
+"""Largest number of hands at the masters for which all combinations are evaluated."""
 
 
 @compiled
 class Impedance(ControlLaw):
-    """Makes each arm move like a mass on a spring and a damper, for several users and a slave.
+    """Control law that makes each arm move like a mass on a spring and a damper.
 
-    The law needs the arm's parameters.
+    Couples several masters and one slave. The dynamic parameters of the arm must be known.
 
     Source: Shahbazi, Atashzar, Talebi and Patel, IEEE/ASME T-Mech 20(4), 2015.
 
     Attributes:
         M: Inertia of the impedance, per joint, kg m^2.
-        B: Damping, per joint, N m s/rad.
-        K: Stiffness, per joint, N m/rad.
-        follows: True for the slave; a master's reference stays at its start pose.
+        B: Damping of the impedance, per joint, N m s/rad.
+        K: Stiffness of the impedance, per joint, N m/rad.
+        follows: True for the slave, False for a master, whose reference stays at its start
+            pose.
     """
 
     M: PositiveJoints = (1.0,)
@@ -69,9 +70,9 @@ class Impedance(ControlLaw):
     needs_model: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: creates its start pose and its desired acceleration.
+        """Prepares the law before a run: allocates its start pose and its desired acceleration.
 
-        The first control period stores the measured pose as the start pose.
+        The measured pose is stored as the start pose in the first tick.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -80,21 +81,19 @@ class Impedance(ControlLaw):
         self.qdd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of the arm in one period of the control loop.
+        """Computes the torque of the arm in one tick.
 
-        First, the acceleration qdd is computed that a mass M on a spring K and a damper B would
-        have:
+        First, computes the acceleration qdd of a mass M on a spring K and a damper B:
 
             M qdd = tau_h + sum_j f_j - B (qd - qd_ref) - K (q - q_ref)
 
-        q and qd are the positions and velocities of the joints, tau_h is the torque of the
-        operator or environment on the arm, and f_j the force that peer j (another arm) sent. At
-        a master, an arm that a person moves, the reference q_ref is the start pose and qd_ref
-        is zero. At the slave, the reference is q_des and qd_des, the weighted motion of the
-        masters, and the force f_j = alpha_j tau_h is sent to master j, where alpha_j is the
-        weight with which the slave follows it.
+        q and qd are the joint positions and velocities, tau_h is the torque that an operator or
+        environment exerts on the arm, and f_j the force sent by peer j. At a master, q_ref is
+        the start pose and qd_ref is zero. At the slave, the reference is q_des and qd_des (the
+        weighted motion of the masters), and the force f_j = alpha_j tau_h is sent to master j,
+        where alpha_j is the dominance factor of this master.
 
-        Then the torque tau is computed that gives the arm this acceleration:
+        Then computes the torque tau that produces this acceleration:
 
             tau = C qd + G + M_arm qdd - tau_h
 
@@ -102,7 +101,7 @@ class Impedance(ControlLaw):
         the arm.
 
         Args:
-            now: Inputs and outputs of the law in this period. The torque is written into
+            now: Inputs and outputs of the law in this tick. The torque is written into
                 `now.tau`. `now.bias` is C qd + G, and `now.tau_x` is -tau_h.
         """
         follows = 1.0 if self.follows else 0.0  # a master's reference and sent force vanish
@@ -136,39 +135,35 @@ class Impedance(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the part of this law that the linear analysis can express by gains: gravity.
+        """Returns the gains of the gravity compensation for the linear analysis.
 
-        The linear analysis considers small motions about a pose at rest. The gains compensate
-        the torque of gravity. The spring, the damper and the forces of this law cannot be
-        expressed by gains; `linear_form` describes them as matrices.
+        The spring, the damper and the forces of this law cannot be expressed as gains.
+        `linear_form` describes them as matrices.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         return Gains(Law.KNOWN, known=theta.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the spring, the damper and the forces of this law for the linear analysis.
 
-        The linear analysis considers small motions around a pose at rest. The law gives the arm
-        the acceleration of a mass M on a spring K and a damper B. For an arm with the inertia
-        matrix A, the torque (without gravity) is
+        The law gives the arm the acceleration of a mass M on a spring K and a damper B. For
+        small motions about a resting pose of an arm with the inertia matrix A, the torque
+        (excluding gravity) is
 
             tau = A inv(M) (tau_h + sum_j f_j - B (qd - qd_des) - K (q - q_des)) - tau_h
 
-        q and qd are the positions and velocities of the joints, tau_h is the torque of the
-        operator or environment on the arm, and f_j the force that peer j (another arm) sends.
-        The desired motion q_des, qd_des belongs to the slave, the arm that follows; at the
-        other arms these terms are missing. The slave sends alpha_j tau_h to peer j, where
-        alpha_j is the weight with which it follows this peer; the other arms send zero.
+        q and qd are the joint positions and velocities, tau_h is the torque that an operator or
+        environment exerts on the arm, and f_j the force sent by peer j. The terms q_des and
+        qd_des (the desired motion) are present only at the slave. The slave sends alpha_j tau_h
+        to peer j, where alpha_j is the dominance factor of this peer. The other arms send zero.
 
-        A block `form.add(row, column, gain)` says that the row contains gain times the column.
-        The column ("from", j) is the force f_j, and the row ("to", j) the force that is sent to
-        peer j.
+        A block `form.add(row, column, gain)` adds gain times the column to the row. The column
+        ("from", j) is the force f_j, and the row ("to", j) the force sent to peer j.
 
         Args:
-            situation: This arm, and the weights with which it follows the other arms.
+            situation: This arm and its dominance factors.
         """
         n = len(situation.inertia)
         form = LinearForm(n)
@@ -199,34 +194,34 @@ class Impedance(ControlLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user that the dominance factors of a master have no effect.
 
-        A master stays at its start pose and does not follow other arms, so its weights have no
-        effect.
+        The reference of a master is its start pose, so a master does not follow other arms.
 
         Returns:
-            A sentence. Empty for the slave.
+            A sentence for the user. Empty for the slave.
         """
         return "" if self.follows else "an arm with follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the loop between the masters and the slave is stable.
 
-        Only a slave that touches something sends forces, which closes a loop. The loop is then
-        judged by the small-gain theorem: it is stable for constant delays of any length if its
-        gain is below 1 at every frequency. A hand at a master changes the gain. A person may
-        also let go. Therefore the gain is computed with each combination of the scenario's
-        hands at the masters, from none to all.
+        A loop exists only while the slave touches something and sends forces. By the small-gain
+        theorem, the loop is stable for any constant delays if its gain is below 1 at every
+        frequency. A hand at a master changes the gain, and a person may let go at any time, so
+        the gain is computed for every combination of the scenario's hands at the masters, from
+        none to all.
 
         The condition is undecided in two cases:
 
-        - A delay varies. The gain at each frequency says nothing about delays that vary.
-        - A hand at a master, or what the slave touches, is not a spring and a damper per joint.
+        - A delay varies, in which case the gain at each frequency is not conclusive.
+        - A hand at a master, or the object that the slave touches, is not a spring and a damper
+          per joint.
 
-        The condition is not met if there is not exactly one slave, if a site uses another law,
-        or if a damping is zero.
+        The condition is not satisfied if there is not exactly one slave, if a site uses another
+        law, or if a damping is zero.
 
         Args:
-            situation: All sites, their laws, what acts on their arms, and the weights with
-                which they follow each other.
+            situation: All sites, their laws, the operators and environments of their arms, and
+                the dominance factors.
         """
         laws = situation.laws
         followers = []
@@ -285,16 +280,16 @@ class Impedance(ControlLaw):
         return StabilityCondition(largest_gain < 1.0, text)
 
     def target_motion(self, run: TuningRun) -> Array | None:
-        """Computes the motion of the impedances that the user has chosen, without any delay.
+        """Computes the ideal motion of the impedances chosen by the user, with no delay.
 
-        The external torques of the run drive the model
+        The model is driven by the external torques of the run:
 
             M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j
 
-        A master of the model stays at its start pose (q_ref is constant) and feels the
-        present torque of the environment at the slave. The slave of the model follows the
-        present pose of the masters of the model. The arms differ from the model by the delays,
-        by the torque limits and by the ticks of the controllers.
+        In the model, the reference q_ref of a master is its start pose, and the master feels
+        the undelayed torque of the environment at the slave. The slave follows the undelayed
+        pose of the masters. The real arms differ from the model because of delays, torque
+        limits and discrete-time control.
 
         Args:
             run: The motion of all arms in the run of a candidate.
@@ -336,14 +331,13 @@ class Impedance(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
         The setting `follows` is true for the slave, which follows the masters, and false for a
-        master, which stays at its start pose.
+        master, which returns to its start pose.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {**gains, "follows": site.role == "slave"}
@@ -357,28 +351,27 @@ def _find_stiffest_wall(
 ) -> float:
     """Returns the largest wall stiffness with loop gain below 1 at all frequencies, N m/rad.
 
-    A loop whose gain is below 1 at every frequency is stable for constant delays of any length
-    (small-gain theorem). The loop from the slave's force to itself has at most the gain
+    A loop whose gain is below 1 at every frequency is stable for any constant delays
+    (small-gain theorem). The gain of the loop from the slave's force to itself is at most
 
         |K_e (K_s + B_s s) / (M_s s^2 + B_s s + K_s + K_e)|
             sum_i a_i^2 / |M_i s^2 + (B_i + b_i) s + K_i + k_i|
 
     where K_e is the stiffness of the wall, the index s denotes the slave, i runs over the
-    masters, k_i and b_i are stiffness and damping of the hand at master i, and s is the Laplace
-    variable. The absolute values are summed, because the delays of the masters may differ. The
-    gain is evaluated on a grid of frequencies and stiffnesses.
+    masters, k_i and b_i are the stiffness and damping of the hand at master i, and s is the
+    Laplace variable. Absolute values are summed because the delays of the masters may differ.
+    The gain is evaluated on a grid of frequencies and stiffnesses.
 
-    A spring at a master can raise the gain, and so can a mass, even though both are passive.
+    A spring or a mass at a master can increase the gain, although both are passive.
 
     Args:
         laws: Settings of the law of each arm.
         dominance_factors: Dominance factors a_i of the slave, shape (N,).
         slave: Index of the slave.
-        hands: Springs and dampers that act on the arm of each site. By default, none act.
+        hands: Springs and dampers that act on the arm of each site. Defaults to none.
 
     Returns:
-        The stiffness. It is inf if any stiffness is allowed, and 0 if not even free motion
-            decays.
+        The stiffness: inf if any stiffness is allowed, and 0 if not even free motion decays.
     """
     for law in laws:
         if any(damping <= 0.0 for damping in law.B):
@@ -416,9 +409,9 @@ def _compute_loop_gain(
 ) -> Array:
     """Returns the gain of the loop from the slave's force to itself, for many frequencies.
 
-    The slave sends the force of its environment to the masters, whose motion it follows.
-    `_find_stiffest_wall` gives the equation of this gain. The loop is stable for constant
-    delays of any length if the gain is below 1 at every frequency.
+    The slave sends the force of its environment to the masters, whose motion it follows. The
+    equation of this gain is given in `_find_stiffest_wall`. The loop is stable for any constant
+    delays if the gain is below 1 at every frequency.
 
     Args:
         laws: Settings of the law of each arm.
@@ -456,14 +449,14 @@ def _compute_loop_gain(
 def _select_master_hands(
     hands: Sequence[Sequence[ArmLoad] | None], slave: int
 ) -> list[tuple[tuple[ArmLoad, ...], ...]] | None:
-    """Returns all combinations of the persons who hold the masters, from nobody to everybody.
+    """Returns all combinations of hands at the masters, from none to all.
 
-    A person may let go of an arm at any time. Therefore stability is checked for each
-    combination.
+    Stability is checked for each combination, because a person may let go of an arm at any
+    time.
 
     Args:
         hands: Springs and dampers that act on the arm of each site.
-        slave: Index of the slave, whose hands are left out.
+        slave: Index of the slave, whose hands are omitted.
 
     Returns:
         For each combination, the hands of each site. None if a hand at a master is not a spring
@@ -488,10 +481,11 @@ def _select_master_hands(
 
 
 def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
-    """Returns a phrase about the walls against which a slave in free motion is stable.
+    """Returns a phrase about the stiffest wall for which the loop is stable.
 
-    Example: "with a spring of up to 250 N m/rad at the slave, ...". The bound is the smallest
-    over all combinations of hands at the masters. Without a bound, the phrase gives the reason.
+    For example, "with a spring of up to 250 N m/rad at the slave, ...". The bound is the
+    minimum over all combinations of hands at the masters. If there is no bound, the phrase
+    states the reason.
 
     Args:
         situation: All sites, their laws and their hands.
@@ -516,18 +510,18 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
 
 
 def move_impedance(law: Any, force: Array, period_s: float) -> Array:
-    """Computes the motion of a mass M on a spring K and a damper B under a force.
+    """Computes the motion of a mass M on a spring K and a damper B under a given force.
 
-    The mass starts at rest at the position 0. The force is held over each period, and the
-    solution is exact for such a force.
+    The mass starts at position 0, at rest. The force is held constant over each period, for
+    which the solution is exact.
 
     Args:
-        law: Settings of the law with M, B and K.
+        law: Settings of the law, which contain M, B and K.
         force: The force, shape (K, n), in N m.
-        period_s: Time between two values of the force, in s.
+        period_s: Time between successive values of the force, in s.
 
     Returns:
-        The position at the K times, shape (K, n), in rad.
+        The position at each of the K times, shape (K, n), in rad.
     """
     joints = force.shape[1]
     gains = [np.broadcast_to(gain, joints) for gain in (law.M, law.B, law.K)]
@@ -552,10 +546,10 @@ def move_impedance(law: Any, force: Array, period_s: float) -> Array:
 
 
 def _exponentiate(matrix: Array) -> Array:
-    """Computes the exponential of a small matrix by scaling and squaring of its power series.
+    """Computes the exponential of a small matrix by scaling and squaring its power series.
 
     Source: Moler and Van Loan, "Nineteen dubious ways to compute the exponential of a matrix",
-    SIAM Review 45, 2003. SciPy is not used, because a session should not depend on SciPy.
+    SIAM Review 45, 2003. SciPy is not used because a session should not depend on it.
 
     Args:
         matrix: The matrix, shape (n, n).

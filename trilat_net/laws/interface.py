@@ -1,15 +1,15 @@
-"""Defines the base classes of the built-in control laws, and how a scenario stores their gains.
+"""Base classes of the built-in control laws, and the scenario tables that store their gains.
 
-A law is one class, whose annotated attributes are its gains, for example `Kd`. From this class
-a second class, its `Settings`, is derived. It is the table of gains in a scenario (the file
-that describes an experiment), and is checked when the file is read. An instance of the law
-itself computes the torques of one arm.
+A law is a class whose annotated attributes, for example `Kd`, are its gains. A second class,
+its `Settings`, is derived from it. `Settings` is the table of gains in a scenario and is
+validated when the scenario is read. An instance of the law itself computes the torques of one
+arm.
 
 Invariant:
     - The annotations of the class are its gains, with ranges and defaults.
-    - The `Settings` of a law take over the methods of the class that depend on gains alone,
+    - The `Settings` of a law inherit those methods of the class that depend on gains alone,
       such as the stability condition.
-    - Laws that the compiled control loop computes itself have a method `gains` instead of
+    - Laws computed by the compiled control loop itself have a method `gains` instead of
       `torque`.
 """
 
@@ -34,8 +34,8 @@ from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCond
 from .sent_vectors import SentVectorSpecs, convert_sends
 
 GainRange = tuple[float, float, str] | tuple[float, float, str, str]
-"""Range of a gain that is tuned: least value, largest value, unit and, optionally, the role of
-the sites that have the gain.
+"""Range of a tunable gain: lower bound, upper bound, unit and, optionally, the role of the
+sites that have the gain.
 """
 STIFFNESS = (1.0, 1000.0, "N m/rad")
 DAMPING = (0.5, 200.0, "N m s/rad")
@@ -46,17 +46,15 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """Facts about one arm, from which a law writes its settings after gains were tuned.
+    """Facts about one arm that a law needs to write its scenario table with tuned gains.
 
-    The method `write_control` of a law receives them.
+    Passed to the method `write_control` of a law.
 
     Attributes:
         role: "master" for an arm that an operator moves, "slave" for an arm that follows.
-        gravity: Ratio of the gravity torque that the law compensates to the true gravity
-            torque. 1 is exact.
-        estimate: First estimate of the arm's dynamic parameters theta, shape (P,), where P is
-            their number. Its gravity terms are the true ones times `gravity`, and its inertia
-            terms are zero.
+        gravity: Ratio of the compensated to the true gravity torque. 1 is exact.
+        estimate: Initial estimate of the arm's P dynamic parameters theta, shape (P,). The
+            gravity terms are the true ones times `gravity`, and the inertia terms are zero.
         box: Lower and upper bounds around the estimate, shape (P,) each.
         longest_ms: Half of the longest mean round trip between two sites, ms.
     """
@@ -69,19 +67,19 @@ class TuningSite(NamedTuple):
 
 
 class TuningRun(NamedTuple):
-    """Motion of all arms in a trial run, from which a law computes how they should have moved.
+    """Motion of all arms in a tuning run, used by a law to compute the desired motion.
 
-    The method `target_motion` of a law receives it, while gains are tuned. The run has N arms,
-    n joints per arm, and K times at equal distances.
+    Passed to the method `target_motion` of a law while gains are tuned. The run has N arms with
+    n joints each, and K equally spaced times.
 
     Attributes:
         laws: Settings of the law of each arm.
         t_s: The times, shape (K,), in s.
         q: Joint angles, shape (N, K, n), in rad.
-        outside_nm: Torques with which operators and environments act on the arms, shape (N, K,
-            n), in N m.
-        alpha: Dominance factors, shape (K, N, N). Row i contains the weights with which site i
-            follows the other sites.
+        outside_nm: Torques that operators and environments exert on the arms, shape (N, K, n),
+            in N m.
+        alpha: Dominance factors, shape (K, N, N). Row i contains the weights that site i gives
+            to the other sites.
     """
 
     laws: "Sequence[LawSettings]"
@@ -92,58 +90,56 @@ class TuningRun(NamedTuple):
 
 
 class LawSettings(Frozen, frozen=True):
-    """Gains of a control law as a scenario stores them, and properties that follow from them.
+    """Gains of a control law as stored in a scenario, and properties derived from them.
 
-    A scenario is the description of an experiment. Every law has a subclass with its own gains,
-    which is derived automatically from the class of the law. Methods that the class of the law
-    defines replace the methods here.
+    Every law has a subclass with its own gains, which is derived automatically from the class
+    of the law. Methods defined by the class of the law override the methods defined here.
     """
 
     kind: ClassVar[Any] = None
-    """The class of the law; None for a law that is imported from a user's file."""
+    """Class of the law. None for a law that is imported from a user's file."""
     linear_note: ClassVar[str] = ""
-    """The effect that the law's linear form leaves out, as a sentence for the user."""
+    """Effect neglected by the law's linear form, as a sentence for the user."""
     fixed_shares: ClassVar[bool] = False
-    """True if the law uses only the dominance factors at the start of the session."""
+    """True if the law uses only the initial dominance factors of the session."""
     has_functional: ClassVar[bool] = False
     """True if the energy function V of the paper's stability proof applies to the law."""
     planar: ClassVar[bool] = False
-    """True if the law uses the planar arm's regressor and cannot control a chain."""
+    """True if the law uses the planar arm's regressor and therefore cannot control a chain."""
     needs_joint_space: ClassVar[bool] = False
-    """True if the law combines numbers per joint with numbers per shared coordinate. It then
-    cannot control arms that share positions of their end effectors.
+    """True if the law combines values per joint with values per shared coordinate. Such a law
+    cannot control arms that share end effector positions.
     """
     compares_positions: ClassVar[bool] = False
-    """True if the law itself compares positions of end effectors, not angles of joints."""
+    """True if the law itself compares end effector positions rather than joint angles."""
 
     @property
     def plugged(self) -> bool:
-        """True if the class of the law computes the torque itself, by a method `torque`.
+        """True if the class of the law computes the torque itself, with a method `torque`.
 
-        Otherwise the simulation kernel, the compiled code of the control loop, contains the
-        law.
+        Otherwise the law is built into the compiled control loop (the simulation kernel).
         """
         return hasattr(self.kind, "torque")
 
     @property
     def books_energy(self) -> bool:
-        """True if the law keeps an account of the energy that the arms exchange.
+        """True if the law keeps an account of the energy exchanged between the arms.
 
-        In this case, all sites must use the law: each site adds up the energy that it sends,
-        and the receiving site subtracts what it uses.
+        In this case, all sites must use the law: each site accumulates the energy that it
+        sends, and the receiving site subtracts the energy that it uses.
         """
         return self.plugged and issubclass(self.kind, EnergyLaw)
 
     @property
     def tag(self) -> str:
-        """Name by which the description of an experiment selects the law, for example "p_d"."""
+        """Name with which a scenario selects the law, for example "p_d"."""
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Rejects gains that contradict each other, and an unsuitable number of arms.
+        """Raises ScenarioError if gains are contradictory or the number of arms is unsuitable.
 
         Args:
-            path: Path of the law's table in the scenario, for errors.
+            path: Path of the law's table in the scenario, for error messages.
             sites: Number of sites in the scenario.
 
         Raises:
@@ -151,43 +147,40 @@ class LawSettings(Frozen, frozen=True):
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Finds a setting of the law that does not suit the rates of the arms' control loops.
+        """Finds a setting of the law that is incompatible with the tick rates of the sites.
 
-        For example, some laws need equal rates at all arms.
+        For example, some laws require equal rates at all sites.
 
         Args:
-            rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
+            rates_hz: Mapping from site name to tick rate, in Hz.
 
         Returns:
-            The key of the setting and the problem. None if all settings are suitable.
+            The key of the setting and the problem. None if all settings are compatible.
         """
         return None
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
         """Converts the gains of the law to the form that the compiled control loop reads.
 
-        By default (`Law.USER`), they tell the loop that the Python class of the law computes
-        the torque.
+        The default result (`Law.USER`) indicates that the Python class of the law computes the
+        torque.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses and inertias, shape (P,),
-                where P is their number.
+            theta: The P dynamic parameters of the arm, such as masses and inertias, shape (P,).
 
         Returns:
-            The record, which names the formula of the torque and contains its gains.
+            The record that selects the torque formula and contains its gains.
         """
         return Gains(Law.USER)
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the gains of a built-in law that has the same linear part as this law.
 
-        For the linear analysis, which considers small motions around a pose at rest, the
-        built-in law takes the place of this law. Terms that the built-in law does not have are
-        added by `linear_form`.
+        The built-in law replaces this law in the linear analysis, which considers small motions
+        about a resting pose. Terms missing from the built-in law are added by `linear_form`.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses and inertias, shape (P,),
-                where P is their number.
+            theta: The P dynamic parameters of the arm, such as masses and inertias, shape (P,).
 
         Returns:
             The gains. None if the law cannot be linearised.
@@ -199,12 +192,11 @@ class LawSettings(Frozen, frozen=True):
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:  # noqa: ARG002
         """Returns the terms of the linearised law that `linear_gains` cannot express.
 
-        The linear analysis describes the law for small motions around a pose at rest. It adds
-        these terms, which are blocks of a matrix, to the spring and the dampers from
-        `linear_gains`.
+        The terms are matrix blocks that describe the law for small motions about a resting
+        pose. The linear analysis adds them to the spring and the dampers from `linear_gains`.
 
         Args:
-            situation: This arm, and the weights with which it follows the other arms.
+            situation: This arm and its dominance factors.
 
         Returns:
             The terms. None if `linear_gains` describes the law completely.
@@ -212,21 +204,19 @@ class LawSettings(Frozen, frozen=True):
         return None
 
     def explain_no_linear_form(self) -> str:
-        """Returns a sentence for the user that says why the law cannot be linearised.
+        """Returns a sentence that tells the user why the law cannot be linearised.
 
-        It is shown if `linear_gains` returns None.
+        Shown if `linear_gains` returns None.
         """
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """Evaluates whether this control law is stable with the gains and delays of a scenario.
 
-        A scenario is the description of an experiment. A law with a known stability condition
-        overrides this method.
+        Overridden by laws with a known stability condition.
 
         Args:
-            situation: The site, its peers (the other sites), their laws and the delays between
-                them.
+            situation: The site, its peers, their laws and the delays between them.
 
         Returns:
             The condition, and whether the scenario satisfies it. None if no condition is known
@@ -237,40 +227,38 @@ class LawSettings(Frozen, frozen=True):
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.
 
-        This requires that the law compensates gravity exactly. Stability conditions of laws of
-        this kind need reversible dominance factors. The dominance factor alpha_ij is the weight
-        with which site i follows site j. The factors are reversible if positive weights D_i
-        exist with D_i alpha_ij = D_j alpha_ji for all pairs of sites.
+        This requires exact gravity compensation. Stability conditions for laws of this kind
+        require reversible dominance factors alpha_ij: there must be positive weights D_i with
+        D_i alpha_ij = D_j alpha_ji for all pairs of sites.
         """
         return False
 
     def target_motion(self, run: TuningRun) -> Array | None:  # noqa: ARG002
-        """Computes how the arms should move with good gains, as the goal of the tuning.
+        """Computes the desired motion of the arms, which is the goal of the tuning.
 
-        Gains are tuned for arms that move together and rest at the pose to which the operators
-        pull them. A law that promises another motion defines this method. Its gains are then
-        tuned for arms that follow this motion.
+        By default, gains are tuned for arms that move together and come to rest at the pose to
+        which the operators pull them. A law with another desired motion overrides this method,
+        and its gains are tuned for arms that follow that motion.
 
         Args:
             run: The motion of all arms in the run of a candidate.
 
         Returns:
-            Joint angles of the promised motion, shape (N, K, n), in rad. None if the law
-            promises that the arms move together.
+            Joint angles of the desired motion, shape (N, K, n), in rad. None if the arms should
+            move together.
         """
         return None
 
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
         """Computes settings of the law that depend on the dominance factors of the scenario.
 
-        A dominance factor is the weight with which a site, the process that runs one arm,
-        follows another site. An example is the impedance of the connection between two sites in
-        the law `wave`. Most laws have no settings of this kind and are returned unchanged.
+        An example is the wave impedance between two sites in the law `wave`. Most laws have no
+        such settings and are returned unchanged.
 
         Args:
             names: Names of the N sites.
-            alpha: Dominance factors at the start, shape (N, N): row i contains the weights with
-                which site i follows the other sites.
+            alpha: Dominance factors at the start, shape (N, N). Row i contains the weights that
+                site i gives to the other sites.
 
         Returns:
             The law with the computed settings.
@@ -280,21 +268,19 @@ class LawSettings(Frozen, frozen=True):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user why the dominance factors of an arm have no effect.
 
-        A dominance factor is the weight with which an arm (site) follows another arm.
-
         Args:
             situation: This arm, and the laws of all arms.
 
         Returns:
-            A sentence. Empty if the dominance factors have an effect.
+            A sentence for the user. Empty if the dominance factors have an effect.
         """
         return ""
 
     @property
     def sends(self) -> SentVectorSpecs:
-        """Vectors that the law sends to other arms besides the motion, such as waves, by name.
+        """Vectors that the law sends in addition to the motion, such as waves, keyed by name.
 
-        Most laws send none.
+        Empty for most laws.
         """
         sends = getattr(self.kind, "sends", {})
         return convert_sends(sends, self.kind.__name__, "control")
@@ -307,15 +293,15 @@ class LawSettings(Frozen, frozen=True):
         sites: int,
         scheme: str,
     ) -> None:
-        """Rejects a class that is not a control law, or that does not suit the arm.
+        """Raises ScenarioError if a class is not a control law, or is unsuitable for the arm.
 
-        A law may restrict its use by class attributes: the number of arms by `sites = 2` or
-        `sites = (2, 4)`, the integration scheme by `schemes = ("digital",)`, and by
-        `needs_theta = True` to arms with known dynamic parameters.
+        A law may restrict its use with class attributes: `sites = 2` or `sites = (2, 4)` for
+        the number of arms, `schemes = ("digital",)` for the integration scheme, and
+        `needs_theta = True` to require known dynamic parameters.
 
         Args:
             kind: The class.
-            code: Name of the law for errors, as in "mylaws:Spring".
+            code: Name of the law for error messages, for example "mylaws:Spring".
             context: Facts about the arm and its controller.
             sites: Number of arms (sites) in the scenario.
             scheme: Integration scheme of the scenario.
@@ -344,23 +330,24 @@ class LawSettings(Frozen, frozen=True):
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
         """Returns a function that creates the control law of one arm before a run.
 
-        The law itself is created later, when the facts about the arm are known.
+        The function is called later, when the facts about the arm are known.
 
         Args:
             sites: Number of sites in the scenario.
             scheme: Integration scheme of the scenario, "second_order" or "digital".
 
         Returns:
-            The function. None if the simulation kernel, the compiled code of the control loop,
-            contains the law, because no instance is needed then.
+            The function. None if the law is built into the compiled control loop (the
+            simulation kernel), in which case no instance is needed.
         """
         if not self.plugged:
             return None
 
         def make_law(context: LawContext) -> UserLaw:
-            """Creates the control law of one arm, if the class of the law suits this arm.
+            """Creates the control law of one arm.
 
-            Otherwise, the check of the class raises an error.
+            Raises:
+                ScenarioError: The class of the law is unsuitable for this arm.
             """
             self.check_class(
                 kind=self.kind,
@@ -376,9 +363,9 @@ class LawSettings(Frozen, frozen=True):
 
 
 def _format_class_name(tag: str) -> str:
-    """Returns the name that the class of a law must have: "FourChannel" for "four_channel".
+    """Returns the required class name of a law, for example "FourChannel" for "four_channel".
 
-    Laws are found by their files. The rule links the file, the class and the name in a
+    Laws are found by file name. This rule links the file, the class and the name used in a
     scenario.
     """
     return "".join(word.capitalize() for word in tag.split("_"))
@@ -387,17 +374,16 @@ def _format_class_name(tag: str) -> str:
 class ControlLaw:
     """Base class of the built-in control laws, which compute the torque of an arm.
 
-    A law may also define the methods of `LawSettings`. When Python creates the class of a law,
-    it derives a second class, `Settings`, which has the gains and these methods.
-    docs/extend/law-interface.md describes the other class variables of a law.
+    A law may also define the methods of `LawSettings`. When the class of a law is created, a
+    second class, `Settings`, is derived from it, with the gains and these methods. The other
+    class variables of a law are described in docs/extend/law-interface.md.
 
     Attributes:
-        Settings: Class that stores the gains of the law in a scenario, the description of an
-            experiment.
-        remembers: Names of the instance attributes that keep the state of the law between ticks
-            (periods of the control loop).
-        tune: Range of each gain that is tuned, by name.
-        known_facts: Sentence for the user. It states which facts about the arm the law needs.
+        Settings: Class that stores the gains of the law in a scenario.
+        remembers: Names of the instance attributes that keep the state of the law between
+            ticks.
+        tune: Mapping from the name of each tunable gain to its range.
+        known_facts: Sentence for the user that states which facts about the arm the law needs.
     """
 
     Settings: ClassVar[type[LawSettings]] = LawSettings
@@ -412,7 +398,7 @@ class ControlLaw:
 
     @staticmethod
     def find_built_in() -> "Iterator[type[ControlLaw]]":
-        """Yields the control law of each Python file in the package of laws that has one."""
+        """Yields the control law defined in each Python file of the package of laws, if any."""
         for file in pkgutil.iter_modules(import_module(__package__).__path__):
             module = import_module(f"{__package__}.{file.name}")
             kind = getattr(module, _format_class_name(file.name), None)
@@ -424,7 +410,7 @@ class ControlLaw:
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
-            gains: Gains by name. Gains that are left out keep their default.
+            gains: Mapping from gain name to value. Omitted gains keep their defaults.
 
         Raises:
             TypeError: The law has no gain of that name.
@@ -438,9 +424,9 @@ class ControlLaw:
         self.begin(facts)
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares a law before the first control period: creates what `torque` uses.
+        """Prepares a law before the first tick by creating the attributes that `torque` uses.
 
-        The gains exist already. A law that needs no other attributes does not override this
+        The gains are already set. A law that needs no other attributes does not override this
         method.
 
         Args:
@@ -451,13 +437,13 @@ class ControlLaw:
     def explain_misfit(cls, roles: Sequence[str]) -> str:
         """Explains to the user why the law cannot couple the arms of a scenario.
 
-        For example, some laws need exactly one master, which a person moves, and one slave.
+        For example, some laws require exactly one master and one slave.
 
         Args:
             roles: Role of each site, "master" or "slave".
 
         Returns:
-            The sentence. Empty if the law fits.
+            A sentence for the user. Empty if the law is suitable.
         """
         required = getattr(cls, "sites", None)
         if required in (None, len(roles)):
@@ -467,14 +453,13 @@ class ControlLaw:
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of the law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of the law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
-        Besides the tuned gains, the table contains settings that follow from the facts about
-        the site.
+        Besides the tuned gains, the table contains settings derived from the facts about the
+        site.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         compensates_gravity = "gravity" in cls.Settings.__struct_fields__
@@ -484,12 +469,12 @@ class ControlLaw:
 
 
 class EnergyLaw(ControlLaw):
-    """Base class of the laws that keep an account of the energy that the arms exchange.
+    """Base class of the laws that keep an account of the energy exchanged between the arms.
 
-    One site counts the energy that it sends, and the other site counts the energy that it uses.
-    Therefore all sites must use the same law. These laws require the integration scheme
-    `digital`, which holds each torque constant for one period of the control loop. Only then is
-    the work of a torque known exactly: it is the torque times the motion of the joint.
+    One site counts the energy that it sends, and another site the energy that it uses, so all
+    sites must use the same law. These laws require the integration scheme `digital`, which
+    holds each torque constant for one control period. Only then is the work of a torque known
+    exactly: the torque times the motion of the joint.
     """
 
     gravity: NotNegative = 1.0
@@ -500,14 +485,14 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
     """Creates the class that stores the gains of a law in a scenario.
 
     A law is written as one class, whose instances compute torques while an arm is controlled. A
-    scenario, the description of an experiment, needs only the gains of the law: it reads and
-    checks them without creating an instance. Therefore a second class is derived, a frozen
-    record (`msgspec.Struct`), so that no author of a law has to write the gains twice.
+    scenario needs only the gains of the law, which are read and validated without creating an
+    instance. A second class, a frozen record (`msgspec.Struct`), is therefore derived, so that
+    authors of laws need not declare the gains twice.
 
-    Annotations of the law and its base classes become the fields of the record; each has a
-    default, which is the value of the class attribute. Methods and class variables that need
-    nothing but the gains are copied (see `_depends_on_gains`), so that for example the
-    stability condition can be evaluated from the record.
+    Annotations of the law and its base classes become the fields of the record, with the values
+    of the class attributes as defaults. Methods and class variables that depend only on the
+    gains are copied (see `_depends_on_gains`), so that the stability condition, for example,
+    can be evaluated from the record.
 
     Args:
         kind: The class of the law.
@@ -555,16 +540,16 @@ def _is_class_variable(hint: Any) -> bool:
 
 
 def _depends_on_gains(name: str, value: Any) -> bool:
-    """Returns True if an attribute of a law's class is copied to the record of its gains.
+    """Returns True if an attribute of a law's class should be copied to its `Settings`.
 
     The record of gains, the class `Settings`, is derived from the class of a law (see
-    `_derive_settings`). It has the gains, but not the state that an instance of the law has
-    while it controls an arm.
+    `_derive_settings`). It contains the gains, but not the state of an instance that controls
+    an arm.
 
-    - Functions and properties are copied if they use the gains alone. `begin`, `torque` and
-      `energies` need the state, and Python's special methods belong to the class itself.
+    - Functions and properties are copied if they use only the gains. `begin`, `torque` and
+      `energies` need the state, and special methods belong to the class itself.
     - Other attributes are copied if they are declared by `LawSettings`, the base class of all
-      records, for example `planar`. The rest are details of the law.
+      records, for example `planar`. All others are internal to the law.
 
     Args:
         name: Name of the attribute.
@@ -580,16 +565,16 @@ def _depends_on_gains(name: str, value: Any) -> bool:
 
 
 def _check_methods(kind: Any, code: str, path: str) -> None:
-    """Rejects a class without a method `torque`, or with a memory that it does not declare.
+    """Raises ScenarioError if a class has no method `torque`, or has undeclared memory.
 
-    The memory of a law is everything that it must know in the next control period. It is
-    logged, so that a run can be verified from any period. A class declares it by `remembers`,
-    or by the methods `memory` and `recall`.
+    The memory of a law is all state that it needs in the next tick. It is logged, so that a run
+    can be verified from any tick. A class declares its memory with `remembers`, or with the
+    methods `memory` and `recall`.
 
     Args:
         kind: The class.
-        code: Name of the law for errors.
-        path: Path of the key for errors.
+        code: Name of the law for error messages.
+        path: Path of the key for error messages.
 
     Raises:
         ScenarioError: The class has no such method, or does not declare its memory.
@@ -617,15 +602,15 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
 
 
 def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
-    """Rejects a law that does not support the number of arms in the scenario.
+    """Raises ScenarioError if a law does not support the number of arms in the scenario.
 
-    The class of a law may state a number or a range in its attribute `sites`, for example
-    `sites = 2` or `sites = (2, 4)`. A site is the process that controls one arm.
+    The class of a law may specify a number or a range in its attribute `sites`, for example
+    `sites = 2` or `sites = (2, 4)`.
 
     Args:
         kind: The class.
-        code: Name of the law for errors.
-        path: Path of the key for errors.
+        code: Name of the law for error messages.
+        path: Path of the key for error messages.
         sites: Number of sites in the scenario.
 
     Raises:
@@ -656,11 +641,11 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
 
 
 def _find_written_attributes(kind: Any) -> list[str]:
-    """Returns the names of the attributes of `self` that a class assigns outside `__init__`.
+    """Returns the names of attributes of `self` that a class assigns outside `__init__`.
 
-    An attribute that changes during a run is a memory, which a control law must declare so that
+    An attribute that changes during a run is memory, which a control law must declare so that
     runs can be repeated from the log. The source of each method is searched for assignments to
-    `self`. Changes by method calls, such as the `append` of a list, are not found.
+    `self`. Changes made by method calls, such as `append` on a list, are not detected.
 
     Args:
         kind: The class of a law.

@@ -1,11 +1,11 @@
-"""Implements the law of Lee and Spong, which computes its damping from the largest delay.
+"""The control law of Lee and Spong, which computes its damping from the largest delay.
 
-The law PD+d couples an arm by a spring (P) and a damper (D) to the arms that it follows. A
-second damper (d) brakes the arm itself. Its damping is computed from the stiffness of the
-spring and the largest delay. Therefore the user states a delay instead of a damping.
+In the law PD+d, a spring (P) and a damper (D) couple an arm to the arms that it follows, and a
+second damper (d) brakes the arm itself. Here the second damping is computed from the spring
+stiffness and the largest delay, so the user specifies a delay instead of a damping.
 
 The compiled control loop computes this law (`core.step.control.damped_torque`).
-`LeeSpong.compute_torque` states the same law in plain Python, and
+`LeeSpong.compute_torque` implements the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -21,7 +21,7 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 
 class LeeSpong(ControlLaw):
-    """Spring to the other arms, with enough damping for all delays up to a known maximum.
+    """Spring coupling with enough damping for all delays up to a known maximum.
 
     The damping is d = K T_max + P_e, where K is the stiffness of the spring, T_max half of the
     longest round trip between the arms, and P_e additional damping.
@@ -33,8 +33,8 @@ class LeeSpong(ControlLaw):
         K: Stiffness per joint, N m/rad.
         Kd: Damping of the error's velocity, per joint, N m s/rad.
         T_max_ms: Half of the longest round trip, ms.
-        P_e: Damping beyond the amount that the delay needs, per joint, N m s/rad.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        P_e: Damping in addition to the damping required by the delay, per joint, N m s/rad.
+        gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -50,7 +50,8 @@ class LeeSpong(ControlLaw):
     def damping(self) -> tuple[float, ...]:
         """Damping d = K T_max + P_e of the arm's velocity per joint, N m s/rad.
 
-        K is the stiffness, T_max half of the longest round trip, P_e the additional damping.
+        K is the stiffness, T_max half of the longest round trip, and P_e the additional
+        damping.
         """
         damping = []
         for K, P_e in zip(self.K, self.P_e, strict=True):
@@ -59,7 +60,7 @@ class LeeSpong(ControlLaw):
         return tuple(damping)
 
     def compute_torque(self, G: Array, e: Array, ed: Array, qd: Array) -> Array:
-        """Computes the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before limiting, N m.
 
             tau = G - K e - (K T_max + P_e) qd - Kd ed
 
@@ -67,8 +68,8 @@ class LeeSpong(ControlLaw):
         the sites (s), P_e additional damping and Kd the damping of the error (both N m s/rad).
 
         Args:
-            G: Torque that compensates gravity, shape (n,) for n joints, N m.
-            e: Position error: position minus reference, shape (n,), rad.
+            G: Gravity compensation torque, shape (n,) for n joints, N m.
+            e: Position error (position minus reference), shape (n,), rad.
             ed: Derivative of the error, shape (n,), rad/s.
             qd: Joint velocities, shape (n,), rad/s.
         """
@@ -81,12 +82,11 @@ class LeeSpong(ControlLaw):
     def gains(self, theta: Array) -> Gains:
         """Converts the gains of this law to the record that the compiled control loop reads.
 
-        The record contains the stiffness, the two dampings, and the parameters from which the
-        gravity torque is computed. The damping of the arm is the property `damping`.
+        The record contains the stiffness, both dampings, and the parameters needed to compute
+        the gravity torque. The damping of the arm is given by the property `damping`.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
@@ -99,31 +99,30 @@ class LeeSpong(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates for which gains and delays this law is stable at one arm of a scenario.
+        """Returns the gains and delays for which this law is stable at one arm of a scenario.
 
-        The known condition for a spring with a damper is used. It bounds the damping from below
-        by the stiffness times the delay.
+        Uses the known condition for a spring with a damper, which requires the damping to
+        exceed the stiffness times the delay.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
-            The condition. None if the law does not compensate gravity exactly, because then no
-            condition is known.
+            The condition. None if gravity compensation is not exact, because no condition is
+            known for that case.
         """
         return situation.judge_position_exchange("damping")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
         The largest delay T_max, from which the law computes its damping, is set to half of the
         longest mean round trip between two sites. If the delays vary, some of them exceed this
         value, and stability is not proved.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {

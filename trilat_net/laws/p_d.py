@@ -1,11 +1,10 @@
-"""Implements P+d: a spring pulls the arm towards its peers, and a damper brakes it.
+"""The control law P+d: a spring pulls the arm towards its peers, and a damper brakes it.
 
-The peers are the arms that this arm follows. The spring (P) acts on the position error, and the
-damper (d) on the arm's own velocity. The law also adds the arm's gravity torque, which it
-computes from known masses.
+The spring (P) acts on the position error, and the damper (d) on the arm's own velocity. The law
+also adds the arm's gravity torque, computed from known masses.
 
 The compiled control loop computes this law (`core.step.control.damped_torque`).
-`PD.compute_torque` states the same law in plain Python, and
+`PD.compute_torque` implements the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -20,20 +19,20 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 
 class PD(ControlLaw):
-    """Spring to the other arms, damper and known gravity: tau = G(q) - K e - d qd.
+    """Spring coupling, damper and known gravity: tau = G(q) - K e - d qd.
 
-    The error e is the position minus the reference, which is the position of the peers,
-    weighted by the dominance factors alpha. For reversible dominance factors, equal gains and
-    one constant delay T, the linearised loop of N sites is stable for all masses if d >
-    max(abs(lambda_min(alpha)), 0.2172) K T. For some masses this bound is also necessary. Two
-    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other dominance factors some heavy arms
-    are unstable at any d. These bounds hold in continuous time: torques that are held over a
-    period need more damping (docs/reference/laws-springs.md).
+    The error e is the position minus the reference (the mean position of the peers, weighted by
+    the dominance factors alpha). For reversible dominance factors, equal gains and one constant
+    delay T, the linearised loop of N sites is stable for all masses if d >
+    max(abs(lambda_min(alpha)), 0.2172) K T. For some masses, this bound is also necessary. For
+    two sites, the condition is 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other dominance factors,
+    some heavy arms are unstable at any d. These bounds hold in continuous time. If torques are
+    held over a control period, more damping is required (docs/reference/laws-springs.md).
 
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping per joint, N m s/rad.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -43,15 +42,15 @@ class PD(ControlLaw):
     tune: ClassVar = {"K": STIFFNESS, "d": DAMPING}
 
     def compute_torque(self, G: Array, e: Array, qd: Array) -> Array:
-        """Computes the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before limiting, N m.
 
             tau = G - K e - d qd
 
         K is the stiffness (N m/rad) and d the damping of the arm (N m s/rad).
 
         Args:
-            G: Torque that compensates gravity, shape (n,) for n joints, N m.
-            e: Position error: position minus reference, shape (n,), rad.
+            G: Gravity compensation torque, shape (n,) for n joints, N m.
+            e: Position error (position minus reference), shape (n,), rad.
             qd: Joint velocities, shape (n,), rad/s.
         """
         spring = np.array(self.K) * e
@@ -61,36 +60,34 @@ class PD(ControlLaw):
     def gains(self, theta: Array) -> Gains:
         """Converts the gains of this law to the record that the compiled control loop reads.
 
-        The record contains the stiffness, the damping, and the parameters from which the
-        gravity torque is computed.
+        The record contains the stiffness, the damping, and the parameters needed to compute the
+        gravity torque.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether the damping suffices for the network delays, for arms of any mass.
+        """Evaluates whether the damping is sufficient for the network delays, for any masses.
 
         Args:
-            situation: All sites, their laws, the delays, and the weights with which they follow
-                each other.
+            situation: All sites, their laws, the delays and the dominance factors.
 
         Returns:
-            The condition of `LawSituation.judge_position_exchange`. None if the law does not
-            compensate gravity exactly, because then no condition is known.
+            The condition of `LawSituation.judge_position_exchange`. None if gravity
+            compensation is not exact, because no condition is known for that case.
         """
         return situation.judge_position_exchange("d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.
 
-        This requires `gravity` = 1, so that the law compensates the gravity torque exactly. The
-        stability condition of the law is proved for this case only, see `condition`. It also
-        needs reversible dominance factors, the weights alpha_ij with which site i follows site
-        j: positive weights D_i must exist with D_i alpha_ij = D_j alpha_ji.
+        This requires exact gravity compensation (`gravity` = 1), the only case for which the
+        stability condition is proved (see `condition`). The condition also requires reversible
+        dominance factors alpha_ij: there must be positive weights D_i with D_i alpha_ij = D_j
+        alpha_ji.
         """
         return self.gravity == 1.0

@@ -1,12 +1,11 @@
-"""Implements direct force reflection: a master feels the external torque on the slave's arm.
+"""Direct force reflection: a master feels the external torque on the slave.
 
-A master is an arm that a person moves, and the slave is the arm that follows it. The slave is
-pulled towards the master by a spring. The torque that the environment exerts on the slave is
-sent back and added to the master's torque. Both arms are damped and compensate their gravity
-torque, which is computed from known masses.
+A spring pulls the slave towards the master, and the torque that the environment exerts on the
+slave is sent back and added to the master's torque. Both arms are damped, and their gravity
+torque, computed from known masses, is compensated for.
 
 The compiled control loop computes this law (`core.step.control.damped_torque`).
-`PF.compute_torque` states the same law in plain Python, and
+`PF.compute_torque` implements the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -25,26 +24,26 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 class PF(ControlLaw):
     """Direct force reflection with known gravity: tau = G(q) - K e - d qd + k_f felt.
 
-    G(q) is the gravity torque. The error e is the position minus the reference, which is the
-    position of the peers, weighted by the dominance factors. `felt` is the torque of operators
-    and environments on the peers' arms as received, with the same weights.
+    G(q) is the gravity torque. The error e is the position minus the reference (the mean
+    position of the peers, weighted by the dominance factors). `felt` is the external torque on
+    the peers' arms as received, with the same weights.
 
-    A slave has K > 0 and k_f = 0, a master K = 0 and k_f > 0. The law serves one master and one
-    slave. The loop is stable in free motion. For any passive operator and any wall, the master
-    needs at least
+    The law couples one master (K = 0 and k_f > 0) and one slave (K > 0 and k_f = 0). The loop
+    is stable in free motion. To be stable for any passive operator and any wall, the master
+    requires at least
 
         d >= k_f (2 K T + d_s)^2 / (4 d_s)
 
-    K and d_s are the slave's gains. This is the edge for a light slave, whose inertia M_s per
-    joint is at most d_s^2 / (4 K). For a heavier slave the edge is higher and has no closed
-    form; the larger of this value and k_f K (2 M_s + T d_s)^2 / (4 M_s d_s) is sufficient
-    (docs/theory/port-conditions.md, 15).
+    where K and d_s are the slave's gains. This stability limit is exact for a light slave,
+    whose inertia M_s per joint is at most d_s^2 / (4 K). For a heavier slave, the limit is
+    higher and has no closed form; the larger of this value and k_f K (2 M_s + T d_s)^2 / (4 M_s
+    d_s) is sufficient (docs/theory/port-conditions.md, 15).
 
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping per joint, N m s/rad.
         k_f: Gain of the reflected force, per joint, dimensionless.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
     K: NotNegativeCoordinates = (0.0,)
@@ -60,7 +59,7 @@ class PF(ControlLaw):
     }
 
     def compute_torque(self, G: Array, e: Array, qd: Array, felt: Array) -> Array:
-        """Computes the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before limiting, N m.
 
             tau = G - K e - d qd + k_f felt
 
@@ -68,11 +67,11 @@ class PF(ControlLaw):
         of the reflected force.
 
         Args:
-            G: Torque that compensates gravity, shape (n,) for n joints, N m.
-            e: Position error: position minus reference, shape (n,), rad.
+            G: Gravity compensation torque, shape (n,) for n joints, N m.
+            e: Position error (position minus reference), shape (n,), rad.
             qd: Joint velocities, shape (n,), rad/s.
-            felt: Torque of operator and environment on the other arm, as received, shape (n,),
-                N m. It is multiplied by the weight with which this arm follows the other arm.
+            felt: External torque on the other arm as received, multiplied by the dominance
+                factor, shape (n,), N m.
         """
         spring = np.array(self.K) * e
         damper = np.array(self.d) * qd
@@ -83,11 +82,10 @@ class PF(ControlLaw):
         """Converts the gains of this law to the record that the compiled control loop reads.
 
         The record contains the stiffness, the damping, the gain of the reflected force, and the
-        parameters from which the gravity torque is computed.
+        parameters needed to compute the gravity torque.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
@@ -100,10 +98,10 @@ class PF(ControlLaw):
         )
 
     def check(self, path: str, sites: int) -> None:
-        """Rejects an experiment that has more or fewer than two arms.
+        """Raises ScenarioError if the scenario does not have exactly two arms.
 
-        With several other arms, it would be ambiguous which contact force the master reflects
-        to its user.
+        With more arms, it would be ambiguous which contact force is reflected to the user of a
+        master.
 
         Args:
             path: Path of the law's settings in the scenario file, for error messages.
@@ -123,12 +121,11 @@ class PF(ControlLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002 - used by other laws
         """Explains to the user that the dominance factors of an arm have no effect.
 
-        Dominance factors are the weights with which an arm follows the other arms. If the
-        stiffness K and the force gain k_f are both zero, the arm neither follows nor feels
-        them.
+        This is the case if the stiffness K and the force gain k_f are both zero: the arm
+        neither follows nor feels the other arms.
 
         Returns:
-            A sentence. Empty if one of the gains is not zero.
+            A sentence for the user. Empty if either gain is not zero.
         """
         if any(self.K) or any(self.k_f):
             return ""
@@ -138,14 +135,13 @@ class PF(ControlLaw):
     def explain_misfit(cls, roles: Sequence[str]) -> str:
         """Explains to the user why force reflection cannot couple the arms of an experiment.
 
-        This law needs exactly one master, the arm that a person moves, and one slave, the arm
-        that follows.
+        This law requires exactly one master and one slave.
 
         Args:
             roles: Role of each site, "master" or "slave".
 
         Returns:
-            The sentence. Empty for one master and one slave.
+            A sentence for the user. Empty for one master and one slave.
         """
         is_one_pair = sorted(roles) == ["master", "slave"]
         if is_one_pair:
@@ -159,13 +155,13 @@ class PF(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario file. They depend on the role of the
-        arm, because only the slave has a spring and only the master feels forces.
+        The table depends on the role of the arm, because only the slave has a spring and only
+        the master feels forces.
 
         Args:
-            gains: The tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         if site.role == "master":

@@ -1,11 +1,11 @@
-"""Implements PD+d: a spring and a damper couple the arm to its peers, and a damper brakes it.
+"""The control law PD+d: a spring and a damper to the peers, and a damper that brakes the arm.
 
-The peers are the arms that this arm follows. The spring (P) acts on the position error, the
-first damper (D) on the derivative of this error, and the second (d) on the arm's own velocity.
-The law also adds the arm's gravity torque, which it computes from known masses.
+The spring (P) acts on the position error, the first damper (D) on the derivative of this error,
+and the second damper (d) on the arm's own velocity. The law also adds the arm's gravity torque,
+computed from known masses.
 
 The compiled control loop computes this law (`core.step.control.damped_torque`).
-`PdD.compute_torque` states the same law in plain Python, and
+`PdD.compute_torque` implements the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
@@ -20,18 +20,18 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 
 
 class PdD(ControlLaw):
-    """Spring and damper to the other arms, known gravity: tau = G(q) - K e - d qd - Kd ed.
+    """Spring and damper coupling, known gravity: tau = G(q) - K e - d qd - Kd ed.
 
-    G(q) is the gravity torque. The error e is the position minus the reference, which is the
-    position of the peers, weighted by the dominance factors; ed is its derivative. For constant
-    delays and a ratio Kd / K that is the same at all sites, the condition of P+d on K and d is
+    G(q) is the gravity torque. The error e is the position minus the reference (the mean
+    position of the peers, weighted by the dominance factors), and ed is its derivative. For
+    constant delays and equal ratios Kd / K at all sites, the condition of P+d on K and d is
     sufficient.
 
     Attributes:
         K: Stiffness per joint, N m/rad.
         Kd: Damping of the error's velocity, per joint, N m s/rad.
         d: Damping of the arm's velocity, per joint, N m s/rad.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -42,7 +42,7 @@ class PdD(ControlLaw):
     tune: ClassVar = {"K": STIFFNESS, "Kd": ERROR_DAMPING, "d": DAMPING}
 
     def compute_torque(self, G: Array, e: Array, ed: Array, qd: Array) -> Array:
-        """Computes the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before limiting, N m.
 
             tau = G - K e - d qd - Kd ed
 
@@ -50,8 +50,8 @@ class PdD(ControlLaw):
         (both N m s/rad).
 
         Args:
-            G: Torque that compensates gravity, shape (n,) for n joints, N m.
-            e: Position error: position minus reference, shape (n,), rad.
+            G: Gravity compensation torque, shape (n,) for n joints, N m.
+            e: Position error (position minus reference), shape (n,), rad.
             ed: Derivative of the error, shape (n,), rad/s.
             qd: Joint velocities, shape (n,), rad/s.
         """
@@ -64,12 +64,11 @@ class PdD(ControlLaw):
     def gains(self, theta: Array) -> Gains:
         """Converts the gains of this law to the record that the compiled control loop reads.
 
-        The record contains the stiffness, the two dampings, and the parameters from which the
-        gravity torque is computed.
+        The record contains the stiffness, both dampings, and the parameters needed to compute
+        the gravity torque.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque.
         known = (theta * self.gravity).tolist()
@@ -82,26 +81,25 @@ class PdD(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Evaluates whether the gains of this law are stable with the delays of a scenario.
+        """Evaluates whether this law is stable with the gains and delays of a scenario.
 
-        The known condition of the law P+d on the stiffness K and the damping d is used. It
-        suffices for constant delays if the ratio Kd / K is the same at all arms.
+        Uses the known condition of the law P+d on the stiffness K and the damping d, which is
+        sufficient for constant delays if the ratio Kd / K is the same at all arms.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
-            The condition of P+d on K and d. None if the law does not compensate gravity
-            exactly, because then no condition is known.
+            The condition of P+d on K and d. None if gravity compensation is not exact, because
+            no condition is known for that case.
         """
         return situation.judge_position_exchange("d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.
 
-        This requires `gravity` = 1, so that the law compensates the gravity torque exactly.
-        Stability conditions of laws of this kind need reversible dominance factors, the weights
-        alpha_ij with which site i follows site j: positive weights D_i must exist with D_i
-        alpha_ij = D_j alpha_ji.
+        This requires exact gravity compensation (`gravity` = 1). Stability conditions for laws
+        of this kind require reversible dominance factors alpha_ij: there must be positive
+        weights D_i with D_i alpha_ij = D_j alpha_ji.
         """
         return self.gravity == 1.0

@@ -1,14 +1,12 @@
-"""Implements a spring law in which the pull of each other arm is limited.
+"""Control law with spring coupling in which the pull towards each peer is limited.
 
-The law P+d couples an arm by a spring (P) to the arms that it follows, its peers, and brakes it
-by a damper (d). Such a spring would pull strongly towards a peer that is far away, for example
-after a network failure. In this law, the pull grows with the distance like a hyperbolic tangent
-and approaches a largest value.
+In the law P+d, a spring (P) couples an arm to its peers, and a damper (d) brakes the arm. Such
+a spring would pull strongly towards a distant peer, for example after a network failure. In
+this law, the pull grows with the distance as a hyperbolic tangent and saturates.
 
 Invariant:
-    - No peer pulls with more than alpha_ij P at any distance. P is the largest pull of all
-      peers together, a gain of the law, and alpha_ij is the dominance factor, the weight with
-      which site i (the controller of an arm) follows peer j.
+    - At any distance, peer j pulls arm i with at most alpha_ij P. P, a gain of the law, is the
+      largest pull of all peers together, and alpha_ij is the dominance factor.
 """
 
 from typing import ClassVar
@@ -23,7 +21,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 @compiled
 class SaturatedPd(ControlLaw):
-    """Couples arms by springs whose pull is limited at any distance, and brakes each arm.
+    """Couples arms with springs that saturate, and brakes each arm.
 
         tau = G - sum_j alpha_ij P tanh(K (q - q_j) / P) - d qd
 
@@ -31,10 +29,10 @@ class SaturatedPd(ControlLaw):
     to varying time delay and bounded inputs", ISA Transactions 68, 2017.
 
     Attributes:
-        K: Stiffness of small errors, per joint, N m/rad.
+        K: Stiffness for small errors, per joint, N m/rad.
         P: Largest pull of all peers together, per joint, N m.
         d: Damping of the arm's velocity, per joint, N m s/rad.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -50,16 +48,16 @@ class SaturatedPd(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of the arm in one tick, a period of the control loop.
+        """Computes the torque of the arm in one tick.
 
             tau = G - sum_j alpha_j P tanh(K (q - q_j) / P) - d qd
 
-        tau is the torque, q and qd are position and velocity of a joint, and q_j the position
-        of peer j, another arm. G is the gravity torque times the gain `gravity`, and d the
-        damping in N m s/rad. Each peer pulls like a spring with the stiffness K (N m/rad) while
-        the distance is small. The hyperbolic tangent never exceeds 1, so the pull of all peers
-        together never exceeds P (N m). It is divided among the peers by the dominance factors
-        alpha_j, the weights with which this arm follows them.
+        tau is the torque, q and qd are the position and velocity of a joint, and q_j the
+        position of peer j. G is the gravity torque times the gain `gravity`, and d the damping
+        in N m s/rad. At small distances, each peer pulls like a spring with the stiffness K (N
+        m/rad). Because the hyperbolic tangent never exceeds 1, the total pull of all peers
+        never exceeds P (N m). It is divided among the peers according to the dominance factors
+        alpha_j.
 
         Args:
             now: Inputs and outputs of the law in this tick. The torque is written into
@@ -80,19 +78,18 @@ class SaturatedPd(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of an unsaturated spring and a damper, for the linear analysis.
+        """Returns the gains of the unsaturated spring and the damper for the linear analysis.
 
-        For small position errors e the spring does not saturate, so this law equals
+        For small position errors e, the spring does not saturate, and the law becomes
 
             tau = G - K e - d qd
 
-        This is a law that the analysis knows (`Law.KNOWN`, the law with known parameters). G is
-        the gravity torque with which the law compensates gravity, K the stiffness in N m/rad, d
-        the damping in N m s/rad and qd the joint velocity.
+        The analysis supports this form (`Law.KNOWN`, the law with known parameters). G is the
+        gravity compensation torque, K the stiffness in N m/rad, d the damping in N m s/rad and
+        qd the joint velocity.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque
         # by `gravity`, the ratio of the compensated gravity torque to the true one.
@@ -102,22 +99,22 @@ class SaturatedPd(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates the stability of this law, and whether its torques stay within limits.
 
-        The condition of a linear spring of stiffness K with a damper applies at any pose at
-        rest, even if sites are held apart. This does not follow from the spring being nowhere
-        stiffer than K. It follows from the slopes of a hyperbolic tangent, which form a
-        positive semidefinite matrix: the Schur product theorem then gives the bound
+        The condition for a linear spring of stiffness K with a damper applies at any resting
+        pose, even if sites are held apart. It is not enough that the spring is nowhere stiffer
+        than K. The proof uses the fact that the slopes of the hyperbolic tangents form a
+        positive semidefinite matrix, and applies the Schur product theorem
         (docs/theory/damping-conditions.md, 13).
 
-        If the gravity torque of the arm is known, the torque limit of each joint must be above
-        the sum of the gravity torque and the largest spring torque P. The text then states the
-        joint speed up to which the damper stays within the remaining torque.
+        If the gravity torque of the arm is known, the torque limit of each joint must exceed
+        the sum of the gravity torque and the largest spring torque P. The text of the condition
+        then states the joint speed up to which the damper stays within the remaining torque.
 
         Args:
-            situation: The site, its peers (the other sites), its torque limits and the delays.
+            situation: The site, its peers, its torque limits and the delays.
 
         Returns:
-            The condition. None if the law does not compensate gravity exactly, because then no
-            condition is known.
+            The condition. None if gravity compensation is not exact, because no condition is
+            known for that case.
         """
         # The condition of P+d, a spring K to the peers and a damper d.
         condition = situation.judge_position_exchange("d")

@@ -1,13 +1,13 @@
-"""Reads and checks which vectors a control law sends to other arms, besides the motion.
+"""Reads and checks the declaration of the vectors that a control law sends.
 
-Some laws send vectors, for example waves or energies. The class of the law declares their names
-and lengths in the class variable `sends`. The receivers need the declaration to read the
-messages.
+Some laws send vectors such as waves or energies in addition to the motion. The class of the law
+declares their names and lengths in the class variable `sends`, which the receivers need to
+decode the messages.
 
 Invariant:
-    - A declaration is a literal in the source of the law, so reading it runs no user code.
-    - The declaration is stored with the resolved scenario, the complete description of an
-      experiment. No other file is needed to read what the law sent in a run.
+    - A declaration is a literal in the source of the law, so no user code is run to read it.
+    - The declaration is stored with the resolved scenario. No other file is needed to decode
+      the vectors sent in a run.
 """
 
 from typing import Annotated, Any, Literal
@@ -22,14 +22,15 @@ from ..records import MAX_JOINTS
 
 
 class _SentVectorSpec(Frozen, frozen=True):
-    """Declaration of a vector that a control law sends in every control period.
+    """Declaration of a vector that a control law sends in every tick.
 
-    The length may depend on the arm, which the class of the law does not know.
+    The length may depend on the arm, which is not known to the class of the law.
 
     Attributes:
-        unit: Unit of its values, as in "J", or "" for dimensionless values.
-        length: Number of its values: "joints", "coordinates" (that sites share), or a number.
-        per_peer: True if each peer gets its own vector, False if all peers get the same vector.
+        unit: Unit of its entries, for example "J", or "" if they are dimensionless.
+        length: Number of entries: "joints", "coordinates" (shared by the sites), or a number.
+        per_peer: True if each peer gets a different vector, False if all peers get the same
+            vector.
     """
 
     unit: Annotated[str, Meta(max_length=24, pattern=r"^[ -~]*$")] = ""
@@ -45,7 +46,7 @@ SentVectorSpecs = dict[str, _SentVectorSpec]
 def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
     """Checks and converts the declaration of the vectors that a control law sends.
 
-    The class variable `sends` declares vectors, each with its name, unit and length.
+    The class variable `sends` declares the name, unit and length of each vector.
 
     Args:
         sends: Value of the class variable.
@@ -53,10 +54,10 @@ def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
         path: Path of the key in the scenario, for error messages.
 
     Returns:
-        A specification for each vector, by its name.
+        A mapping from vector name to specification.
 
     Raises:
-        ScenarioError: The value does not describe vectors.
+        ScenarioError: The value is not a valid declaration.
     """
     try:
         return msgspec.convert(sends, SentVectorSpecs)

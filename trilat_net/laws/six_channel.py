@@ -1,12 +1,12 @@
-"""Implements a control law in which two users share one slave arm by a single factor a.
+"""Control law with which two users share one slave arm, governed by a single factor a.
 
 The factor a is the authority of user 1, and user 2 has the authority 1 - a. For a = 0.5, both
-users lead the slave equally. The factor determines the weights with which each arm follows the
-other two, which are called dominance factors: `complementary_shares` computes them.
+users have equal influence on the slave. All dominance factors of the three arms are determined
+by a (see `complementary_shares`).
 
-The torque is computed by the four-channel law, which exchanges positions and forces
-(`FourChannel`). This law adds the check that the weights in a scenario, the description of an
-experiment, follow from one factor a.
+The torque is that of the four-channel law, which exchanges positions and forces
+(`FourChannel`). In addition, this law checks that the dominance factors of a scenario are
+consistent with a single factor a.
 """
 
 from typing import ClassVar
@@ -19,12 +19,12 @@ from .four_channel import FourChannel
 
 
 class SixChannel(FourChannel):
-    """Lets two users share a slave arm by a single factor a, their authority.
+    """Lets two users share a slave arm according to a single factor a, the authority of user 1.
 
-    The arms exchange positions and forces as in `FourChannel`. The sites, the processes that
-    run one arm each, are user 1, user 2 and the slave, in this order. The slave follows user 1
-    with the weight a and user 2 with 1 - a. User 1 follows the slave with the weight a and user
-    2 with 1 - a. User 2 follows the slave with the weight 1 - a and user 1 with a.
+    The arms exchange positions and forces as in `FourChannel`. The sites must be listed as user
+    1, user 2, slave. The slave follows user 1 with the weight a and user 2 with 1 - a. User 1
+    follows the slave with the weight a and user 2 with 1 - a. User 2 follows the slave with the
+    weight 1 - a and user 1 with a.
 
     Source: Khademian and Hashtrudi-Zaad, IEEE/ASME T-Mech 17, 2012.
     """
@@ -34,19 +34,18 @@ class SixChannel(FourChannel):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates the stability condition of the four-channel law for two users and a slave.
 
-        The sites, the processes that run one arm each, are user 1, user 2 and the slave, in
-        this order. All dominance factors, the weights with which the arms follow each other,
-        must follow from one number a, the authority of user 1 (see `complementary_shares`).
+        The sites must be listed as user 1, user 2, slave. All dominance factors must be
+        consistent with a single factor a, the authority of user 1 (see `complementary_shares`).
 
         Args:
-            situation: The three sites and the dominance factors: row i of `alpha` contains the
-                weights with which site i follows the others.
+            situation: The three sites and the dominance factors. Row i of `alpha` contains the
+                weights that site i gives to the others.
 
         Returns:
-            A condition that is not met if the dominance factors do not follow from one number.
-            Otherwise the condition of the four-channel law, which may be undecided. Its text
-            then begins with a, and with the weights beta with which the torques of the
-            operators add up to zero at rest.
+            If the dominance factors are not consistent with a single factor, a condition that
+            is not satisfied. Otherwise the condition of the four-channel law, which may be
+            undecided. Its text begins with a and the weights beta with which the operators'
+            torques add up to zero at rest.
         """
         if len(situation.alpha) != 3:
             return StabilityCondition(False, "this law is for two users and a slave")
@@ -73,16 +72,15 @@ class SixChannel(FourChannel):
 def complementary_shares(a: float) -> Array:
     """Computes all dominance factors of two users and a slave from the single factor a.
 
-    A dominance factor is the weight with which an arm follows another arm. The slave follows
-    user 1 with the weight a and user 2 with 1 - a. User 1 follows user 2 with 1 - a and the
-    slave with a. User 2 follows user 1 with a and the slave with 1 - a.
+    The slave follows user 1 with the weight a and user 2 with 1 - a. User 1 follows user 2 with
+    1 - a and the slave with a. User 2 follows user 1 with a and the slave with 1 - a.
 
     Args:
         a: Authority of user 1, from 0 to 1. User 2 has 1 - a.
 
     Returns:
-        Matrix of shape (3, 3). Row i contains the weights with which arm i follows the others,
-        in the order user 1, user 2, slave.
+        Dominance matrix, shape (3, 3), in the order user 1, user 2, slave. Row i contains the
+        weights that arm i gives to the others.
     """
     user_1 = (0.0, 1.0 - a, a)
     user_2 = (a, 0.0, 1.0 - a)
@@ -93,19 +91,18 @@ def complementary_shares(a: float) -> Array:
 def complementary_weights(a: float) -> tuple[float, float, float]:
     """Computes the weights beta with which the operators' torques add up to zero at rest.
 
-    While all arms rest, sum_i beta_i tau_i = 0, where tau_i is the torque of the operator or
-    environment on arm i, in N m.
+    While all arms rest, sum_i beta_i tau_i = 0, where tau_i is the external torque on arm i, in
+    N m.
 
-    The weights follow from the matrix A of the dominance factors (`complementary_shares`),
-    whose row i contains the weights with which arm i follows the others. At rest, springs
-    balance the torques, tau = K (q - A q), where K is the stiffness and q the positions.
-    Therefore beta is a vector with beta A = beta, written out
+    The weights follow from the dominance matrix A (see `complementary_shares`). At rest,
+    springs balance the external torques: tau = K (q - A q), where K is the stiffness and q are
+    the positions. Therefore beta satisfies beta A = beta, that is,
 
         beta_1 = a beta_2 + a beta_3
         beta_2 = (1 - a) beta_1 + (1 - a) beta_3
         beta_3 = a beta_1 + (1 - a) beta_2
 
-    Such a vector may be multiplied by any number; here it is not scaled to a certain sum.
+    The vector is determined up to a factor, and is not normalised here.
 
     Args:
         a: Authority of user 1, from 0 to 1.

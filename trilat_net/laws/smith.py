@@ -1,8 +1,9 @@
-"""Implements a spring law of a master and a slave with a predictor that removes the delay.
+"""Spring coupling of a master and a slave with a Smith predictor.
 
-A Smith predictor removes a delay from a control loop: the controller follows a model of the
-remote side that has no delay, and corrects it by the delayed difference from the true motion.
-In this law, it extends P+d, a spring between the arms and a damper at each arm.
+A Smith predictor removes a delay from a control loop: the controller follows an undelayed model
+of the remote side, and corrects the model with the delayed difference from the true motion.
+Here the predictor extends P+d, which consists of a spring between the arms and a damper at each
+arm.
 
     slave    tau = G - K (q_s - q_m(t - T)) - d qd_s
              sends w = q_s - x, where the model x is driven by q_m(t - T)
@@ -10,14 +11,14 @@ In this law, it extends P+d, a spring between the arms and a damper at each arm.
     model    inertia x'' = K (q_m - x) - d x'
 
 Here q_m, q_s, qd_m and qd_s are the positions and velocities of master and slave, tau is the
-torque of an arm and G its gravity torque, T is the delay, K a stiffness and d a damping. Both
-ends run the same model, so the law stores no past values, however long the delay is. The signal
-w is the part of the slave's motion that the model does not predict, for example in contact. The
-master is the site with `predicts` = true.
+torque of an arm and G its gravity torque, T is the delay, K a stiffness and d a damping.
+Because both sites run the same model, no past values need to be stored, however long the delay
+is. The signal w is the part of the slave's motion that the model does not predict, for example
+in contact. The master is the site with `predicts` = true.
 
 Invariant:
-    - The model moves like an arm whose torque is held over each tick, a period of the control
-      loop (scheme `digital`).
+    - The model moves like an arm whose torque is held constant over each tick (scheme
+      `digital`).
 """
 
 from collections.abc import Mapping
@@ -33,11 +34,11 @@ from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
 
 @compiled
 class Smith(ControlLaw):
-    """Couples a master and a slave by springs, with a Smith predictor against the delay.
+    """Couples a master and a slave with springs and a predictor that removes the delay.
 
-    A spring and a damper pull each arm towards the other. The master does not wait for the
-    delayed position of the slave: it uses a model of the slave, and corrects the model with the
-    delayed deviation from the true motion. The equations are at the top of this module.
+    A spring pulls each arm towards the other, and a damper brakes it. Instead of waiting for
+    the delayed position of the slave, the master uses a model of the slave and corrects it with
+    the delayed deviation from the true motion. The equations are given in the module docstring.
 
     Source: Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53,
     1957 (cited from memory).
@@ -45,10 +46,10 @@ class Smith(ControlLaw):
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping of the arm's velocity, per joint, N m s/rad.
-        inertia: Inertia of the slave's model, per joint, kg m^2. K, d and inertia are the same
-            at both sites.
+        inertia: Inertia of the slave's model, per joint, kg m^2. K, d and inertia must be the
+            same at both sites.
         predicts: True for the master.
-        gravity: Ratio of the compensated gravity torque to the true gravity torque. 1 is exact.
+        gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -64,10 +65,10 @@ class Smith(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: creates the state of the slave's model.
+        """Prepares the law before a run by creating the state of the slave's model.
 
-        The state is the position x and the velocity xd. The model predicts the motion of the
-        slave without delay. The first control period sets its position.
+        The model predicts the undelayed motion of the slave. Its state consists of the position
+        x, which is initialised in the first tick, and the velocity xd.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -76,14 +77,14 @@ class Smith(ControlLaw):
         self.xd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one control period, and advances the model of the slave.
+        """Computes the torque of one tick, and advances the model of the slave.
 
         Master and slave run the same model of the slave's motion. The slave sends the
         difference w between its position and the position of the model. The master is pulled
         towards the position of its model plus the received w.
 
         Args:
-            now: Inputs and outputs of the law in this period. The torque is written into
+            now: Inputs and outputs of the law in this tick. The torque is written into
                 `now.tau`.
         """
         h = now.h_s
@@ -120,13 +121,12 @@ class Smith(ControlLaw):
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the gains of this law's spring and damper for the linear analysis.
 
-        The linear analysis considers small motions around a pose at rest. At the slave, the
-        gains contain the spring K and the damping d. At the master they contain only d, because
-        its spring acts on the model of the slave, which `linear_form` adds.
+        At the slave, the gains contain the stiffness K and the damping d. At the master, they
+        contain only d, because the master's spring acts on the model of the slave, which
+        `linear_form` adds.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         K = (0.0,) if self.predicts else self.K
         # The gravity torque is linear in the parameters: scaled parameters scale the torque.
@@ -136,10 +136,9 @@ class Smith(ControlLaw):
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the model of the slave and its effect on the law, for the linear analysis.
 
-        The linear analysis considers small motions around a pose at rest. The model is a mass
-        on a spring and a damper that the master's position moves; its states are the position x
-        and the velocity xd. At the master, the torque depends on x. At the slave, the
-        difference between its position and x is sent to the master.
+        The model is a mass on a spring and a damper, driven by the position of the master. Its
+        states are the position x and the velocity xd. The torque of the master depends on x,
+        and the slave sends the master the difference between its position and x.
 
         Args:
             situation: This arm and the only other arm.
@@ -168,10 +167,10 @@ class Smith(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the predictor removes the delay from the control loop.
 
-        Exactly one of the two arms must predict, and K, d and inertia must be equal at both.
-        Otherwise the condition is not met. If both requirements are met, the condition is
-        undecided (`holds` is None): the loop is stable while the slave moves freely, but the
-        model does not include contacts.
+        Exactly one of the two arms must predict, and K, d and inertia must be equal at both
+        arms. Otherwise the condition is not satisfied. If both requirements are satisfied, the
+        condition is undecided (`holds` is None): the loop is stable while the slave moves
+        freely, but the model does not include contacts.
 
         Args:
             situation: The two arms and their laws.
@@ -194,14 +193,13 @@ class Smith(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
         The setting `predicts` is true for the master, which predicts the motion of the slave
         with a model, and false for the slave.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {**gains, "predicts": site.role == "master", "gravity": site.gravity}

@@ -1,19 +1,18 @@
-"""Implements adaptive synchronisation of outputs, a control law with a flaw under gravity.
+"""Adaptive output synchronisation, a control law with a flaw under gravity.
 
-The law makes the outputs r = qd + Lambda q of all arms equal, where q and qd are the positions
-and velocities of the joints, and Lambda is a gain. While it controls an arm, it learns the
-dynamic parameters of the arm, such as masses.
+The law makes the outputs r = qd + Lambda q of all arms equal, where q and qd are the joint
+positions and velocities, and Lambda is a gain. The dynamic parameters of the arm, such as
+masses, are learnt during control.
 
-The flaw: an arm can rest only if its parameter estimate is also at rest. This requires Y_G' r =
-0, where Y_G is the matrix whose product with the parameters is the gravity torque, and Y_G' its
-transpose. At rest, r is Lambda q. Therefore under gravity each arm ends at q = 0, or where its
-links have no lever arm: it hangs, with cos q1 = 0 and cos(q1 + q2) = 0. Users cannot hold it
-anywhere else. Laws that compare positions, such as `adaptive`, do not have this flaw, because
-their r contains the position error instead of q.
+The flaw: an arm can rest only if its parameter estimate is also constant. This requires Y_G' r
+= 0, where Y_G is the matrix whose product with the parameters is the gravity torque, and Y_G'
+its transpose. At rest, r equals Lambda q. Under gravity, each arm therefore ends at q = 0, or
+hanging, where its links have no lever arm (cos q1 = 0 and cos(q1 + q2) = 0). Users cannot hold
+it anywhere else. Laws that compare positions, such as `adaptive`, do not have this flaw,
+because their r contains the position error instead of q.
 
 Invariant:
-    - The estimate of the parameters is integrated by the trapezoid rule, as in the law
-      `adaptive`.
+    - The parameter estimate is integrated with the trapezoid rule, as in the law `adaptive`.
 """
 
 from collections.abc import Mapping
@@ -41,13 +40,12 @@ class Sync(ControlLaw):
         tau = Y theta_hat + K (sum_j alpha_ij r_j - r)
         rate of theta_hat = -Gamma Y' r
 
-    q and qd are the positions and velocities of the joints, r_j the output of arm j as
-    received, and alpha_ij the weight with which arm i follows arm j. theta_hat is the estimate
-    of the arm's dynamic parameters. The matrix Y(q, qd, -Lambda q, -Lambda qd) is the
-    regressor: its product with the parameters is the torque of the arm's dynamics. Y' is its
-    transpose.
+    q and qd are the joint positions and velocities, r_j the output of arm j as received, and
+    alpha_ij its dominance factor at arm i. theta_hat is the estimate of the arm's dynamic
+    parameters. The matrix Y(q, qd, -Lambda q, -Lambda qd) is the regressor: its product with
+    the parameters is the torque of the arm's dynamics. Y' is its transpose.
 
-    Weakness: under gravity all arms end at q = 0 or hanging. The law is for planar arms.
+    Weakness: under gravity, all arms end at q = 0 or hanging. Only planar arms are supported.
 
     Source: Chopra, Spong and Lozano, "Synchronization of bilateral teleoperators with time
     delay", Automatica 44, 2008; the weakness is described by Nuno, Ortega and Basanez,
@@ -55,9 +53,9 @@ class Sync(ControlLaw):
 
     Attributes:
         Lambda: Weight of the position in r, per joint, 1/s.
-        K: Gain towards the outputs of the other arms, per joint, N m s/rad.
+        K: Coupling gain of the outputs, per joint, N m s/rad.
         Gamma: Adaptation gain per parameter.
-        theta_hat0: First estimate of theta, Eq. (24).
+        theta_hat0: Initial estimate of theta, Eq. (24).
     """
 
     Lambda: PositiveJoints = (1.0,)
@@ -71,11 +69,10 @@ class Sync(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate"
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: creates the estimate of the parameters.
+        """Prepares the law before a run by creating the parameter estimate.
 
-        The estimate of the arm's dynamic parameters starts at the setting `theta_hat0`. Its
-        rate in the previous control period is kept, because the estimate is integrated by the
-        trapezoid rule.
+        The initial estimate of the arm's dynamic parameters is the setting `theta_hat0`. Its
+        rate in the previous tick is also stored, as required by the trapezoid rule.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -85,23 +82,23 @@ class Sync(ControlLaw):
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque and the new estimate of the parameters in one tick.
+        """Computes the torque and the new parameter estimate in one tick.
 
-        A tick is one period h of the control loop. The law is
+        The law is
 
             r = qd + Lambda q
             tau = K (r_des - r) + Y theta_hat,    r_des = qd_des + Lambda q_des
             rate of theta_hat = -Gamma Y' r
 
         q and qd are the positions and velocities of the two joints. q_des and qd_des are those
-        of the peers, the other arms, averaged with the weights with which this arm follows
-        them. K (N m s/rad), Lambda (1/s) and Gamma are gains. theta_hat is the estimate of the
-        arm's parameters, and Y the regressor: the matrix whose product with the parameters is
-        the torque of the arm's dynamics, for the reference velocity v = -Lambda q and the
-        acceleration a = -Lambda qd. Y' is its transpose. r is also qd - v.
+        of the peers, averaged with the dominance factors. K (N m s/rad), Lambda (1/s) and Gamma
+        are gains. theta_hat is the estimate of the arm's parameters, and Y is the regressor: Y
+        times the parameters is the torque of the arm's dynamics for the reference velocity v =
+        -Lambda q and acceleration a = -Lambda qd. Y' is its transpose. Note that r = qd - v.
 
-        The regressor is evaluated once for the torque and the estimate. The estimate is
-        integrated by the trapezoid rule: the mean of the old and the new rate, times h.
+        The regressor is evaluated once for both the torque and the estimate. The estimate is
+        integrated with the trapezoid rule, which multiplies the mean of the old and the new
+        rate by the control period.
 
         Args:
             now: Inputs and outputs of the law in this tick. The torque is written into
@@ -144,16 +141,15 @@ class Sync(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
-        """Returns gains with which the linear analysis treats this law as the adaptive law.
+        """Returns gains that represent this law as an adaptive law in the linear analysis.
 
-        Both laws use the same formula, but with different outputs: r = qd + Lambda q here, and
-        r = qd + Lambda e in the adaptive law. Here q and qd are position and velocity of a
-        joint, e is the position error, and Lambda a gain in 1/s. The flag `absolute` selects
-        the first form.
+        Both laws use the same formula, but with different outputs: r = qd + Lambda q in this
+        law, and r = qd + Lambda e in the adaptive law. q and qd are the position and velocity
+        of a joint, e is the position error, and Lambda a gain in 1/s. The flag `absolute`
+        selects the first form.
 
         Args:
-            theta: Parameters of the arm's dynamics. This law does not use them, because it
-                learns them.
+            theta: True parameters of the arm, unused because this law learns them.
         """
         return Gains(
             law=Law.ADAPTIVE,
@@ -167,9 +163,9 @@ class Sync(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether this law is known to be stable in a scenario.
 
-        The stability proof requires that all delays are constant. If a delay varies, the
-        condition is undecided (`holds` is None). If all are constant, the text also warns that
-        under gravity the arms end only at poses with Y_G' r = 0.
+        The stability proof requires constant delays. If a delay varies, the condition is
+        undecided (`holds` is None). If all delays are constant, the text also warns that under
+        gravity the arms end only at poses with Y_G' r = 0.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
@@ -186,17 +182,17 @@ class Sync(ControlLaw):
         return StabilityCondition(True, text)
 
     def target_motion(self, run: TuningRun) -> Array | None:
-        """Computes the mean motion of the arms, because the law promises agreement only.
+        """Computes the mean motion of the arms, which is the goal of the tuning for this law.
 
-        The law makes the outputs r of all arms equal. It does not promise that they rest at the
-        pose to which the operators pull them: under gravity it does not.
+        The law only makes the outputs r of all arms equal. Under gravity, the arms do not come
+        to rest at the pose to which the operators pull them.
 
         Args:
             run: The motion of all arms in the run of a candidate.
 
         Returns:
-            The mean over the arms for each arm, shape (N, K, n), in rad. None if a site uses
-            another law.
+            The mean over the arms, repeated for each arm, shape (N, K, n), in rad. None if a
+            site uses another law.
         """
         if any(law.kind is not Sync for law in run.laws):
             return None
@@ -205,14 +201,13 @@ class Sync(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
-        The tuning uses one name, `Kp`, for the damping gains of all adaptive laws. In the
-        settings of this law the gain is called `K`.
+        The tuning uses the name `Kp` for the damping gains of all adaptive laws. In the table
+        of this law, the gain is called `K`.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {

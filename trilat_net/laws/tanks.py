@@ -1,18 +1,18 @@
-"""Couples arms by springs that may spend only the energy that is in a tank.
+"""Couples arms with springs that may only use the energy stored in a tank.
 
-Delays can make a spring between two arms active, which means that it produces energy. Therefore
-each site, the process that runs one arm, keeps an account of the energy that its controller may
-spend: the tank. The controller has two layers. The transparency layer computes the torque of a
-spring and dampers that couple the arm to the other arms, its peers. The passivity layer reduces
-this torque so that its work does not exceed the energy in the tank.
+Delays can make a spring between two arms active, that is, make it produce energy. Each site
+therefore keeps an account of the energy that its controller may still spend: the tank. The
+controller has two layers. The transparency layer computes the torque of a spring and dampers
+that couple the arm to its peers. The passivity layer reduces this torque such that its work
+does not exceed the energy in the tank.
 
 Invariant:
-    - The tank is filled by the work that the arm does on its controller, and by energy that the
-      peers send. It is emptied by the work of the controller on the arm. The work is the torque
-      times the motion of the joint in a period of the control loop.
+    - The tank is filled by the work that the arm does on its controller, and by energy sent by
+      the peers. It is emptied by the work of the controller on the arm. This work is the torque
+      times the motion of the joint in a control period.
     - While the tank is empty, the torque of the transparency layer is zero.
-    - A message states the sum of all energy sent so far. Therefore no energy is lost with a
-      lost message.
+    - A message states the cumulative energy sent so far, so no energy is lost when a message is
+      lost.
 """
 
 from typing import Any, ClassVar
@@ -27,11 +27,10 @@ from .interface import ERROR_DAMPING, STIFFNESS, EnergyLaw
 
 @compiled
 class Tanks(EnergyLaw):
-    """Couples arms by springs whose work is limited by one energy tank per arm.
+    """Couples arms with springs whose work is limited by one energy tank per arm.
 
     A tank is the amount of energy that the controller of an arm may still spend. The law is
-    passive for any delays and for any dominance factors, the weights with which an arm follows
-    its peers (the other arms).
+    passive for any delays and any dominance factors.
 
     Source: Franken, Stramigioli, Misra, Secchi and Macchelli, IEEE Transactions on Robotics 27
     (4), 2011.
@@ -41,14 +40,14 @@ class Tanks(EnergyLaw):
         Kd: Damping of the error's velocity, per joint, N m s/rad.
         d: Damping of the arm's velocity, per joint, N m s/rad.
         level_J: Level to which a tank is refilled, J.
-        fill_nm_s_rad_J: Damping of the arm per energy that the tank lacks, N m s/rad/J. It
-            refills the tank from the motion of the arm.
-        packet_1_s: Rate at which a tank is emptied towards the peers, 1/s.
+        fill_nm_s_rad_J: Damping of the arm per unit of energy missing from the tank, N m
+            s/rad/J. This damping refills the tank from the motion of the arm.
+        packet_1_s: Rate at which the energy in a tank is sent to the peers, 1/s.
         by_shares: If True, the energy for the peers is divided by the dominance factors of this
-            arm. If False, every peer gets the same part.
+            arm. If False, all peers get equal parts.
         acceleration_rad_s2: Largest acceleration a of a joint for which the tank reserves
-            energy: in the coming period h the joint moves by up to qd h + a h^2 / 2, where qd
-            is its velocity.
+            energy, rad/s^2. With the velocity qd, the joint is assumed to move by up to qd h +
+            a h^2 / 2 in the next control period h.
     """
 
     K: PositiveJoints = (100.0,)
@@ -68,17 +67,16 @@ class Tanks(EnergyLaw):
     remembers: ClassVar = ("E_seen", "carried")
     tune: ClassVar = {"K": STIFFNESS, "Kd": ERROR_DAMPING}
     guarded = True
-    """False leaves the transparency layer without a tank, for comparison."""
+    """False disables the tank of the transparency layer, for comparison."""
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: creates its state and its constants.
+        """Prepares the law before a run by creating its state and constants.
 
-        The state consists of the sum of the energy received from each peer (another arm), and
-        the gravity torque of the previous control period.
+        The state consists of the total energy received from each peer, and the gravity torque
+        of the previous tick.
 
         Args:
-            facts: Facts about the site (the process that runs the arm) that are known before
-                the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         # Whether the tank limits the torque, as a bool of this instance.
         self.guarded = bool(self.guarded)
@@ -93,12 +91,12 @@ class Tanks(EnergyLaw):
         self.carried = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of a control period, and sends energy packets to the other arms.
+        """Computes the torque of one tick, and sends energy packets to the other arms.
 
-        First, the work of the previous period and the received packets are entered in the
-        energy account, and packets are sent. Then the torque of the springs that couple the
-        arms is computed, and reduced until the energy in the tank covers its work. Damping is
-        added while the tank is below its level.
+        First, the work of the previous control period and the received packets are entered into
+        the energy account, and packets are sent. Then the torque of the coupling springs is
+        computed, and reduced until the energy in the tank covers its work. Damping is added
+        while the tank is below its target level.
 
         Args:
             now: Inputs and outputs of the law in this tick.
@@ -159,22 +157,22 @@ class Tanks(EnergyLaw):
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
 
-        Each arm has an energy tank, the amount of energy that its controller may still spend.
-        All energies are in J. In the records (one per control period),
+        All energies are in J. The records contain, for each tick:
 
-        - "E" is the sum of the energy sent to a peer (another arm) so far;
-        - "E_seen" is the sum of the energy received so far, one column per peer;
-        - "H" is the energy in the tank;
-        - "carried" is the part of the torque that compensates gravity, N m. Its work does not
-          come from the tank, so it is subtracted from the torque.
+        - "E": the total energy sent to a peer so far;
+        - "E_seen": the total energy received so far, one column per peer;
+        - "H": the energy in the tank (the energy that the controller may still spend);
+        - "carried": the part of the torque that compensates for gravity, N m. It is subtracted
+          from the torque, because its work does not come from the tank.
 
         Args:
-            seen: Records of the site (the process that runs the arm) in the run.
+            seen: Records of the site in the run.
 
         Returns:
             The energy sent to each peer (`gave`) and received from it (`took`), the energy that
-            the arm gave to the controller (`port`), and the energy in the tank (`store`). No
-            energy counts as dissipated (`taken`), because damping moves energy into the tank.
+            the arm supplied to the controller (`port`), and the energy in the tank (`store`).
+            No energy counts as dissipated (`taken`), because damping transfers energy to the
+            tank.
         """
         sent_energies = [peer.sent["E"] for peer in seen.peers]
         E_seen = seen.memory["E_seen"]
@@ -200,13 +198,13 @@ class Tanks(EnergyLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the energy tanks keep the coupled arms passive.
 
-        Passive means that they never give more energy than they received. A tank is the amount
-        of energy that the controller of an arm may still spend. In each control period, the
-        controller sends a fixed part of this energy to the other arms. The condition is met if
-        this part is at most 1, provided that persons and environments are passive.
+        Passive means that they never supply more energy than they received. In each tick, the
+        controller sends a fixed fraction of the energy in its tank to the other arms. The
+        condition is satisfied if this fraction is at most 1, provided that operators and
+        environments are passive.
 
         Args:
-            situation: This arm, with the rate of its control loop.
+            situation: This arm, including its tick rate.
         """
         part_per_tick = self.packet_1_s / situation.rate_hz
         if part_per_tick > 1.0:

@@ -1,27 +1,27 @@
-"""Couples arms by time-domain passivity control (TDPA): delays cannot create energy.
+"""Time-domain passivity control (TDPA) of coupled arms: delays cannot create energy.
 
 A coupling connects two arms, a leader and a follower. Each end of a coupling keeps an account
-of the energy that went in and out. If an end is about to take out more energy than the other
-end has reported as put in, its controller reduces the torque or the velocity.
+of the energy that enters and leaves it. If an end would extract more energy than the other end
+has reported as input, its controller reduces the torque or the velocity.
 
-A follower is pulled to a moving goal by a spring K and a damper B with the torque F:
+A spring K and a damper B pull a follower towards a moving goal with the torque F:
 
     F = K (goal - q) + B (v - qd)
     rate of goal = v = sum_j alpha_j v_j
 
-q and qd are position and velocity of the follower, v_j the velocity of leader j and alpha_j the
-weight with which the follower follows it. Leader j feels -alpha_j F. Two arms that follow each
-other have two couplings. While an arm waits or is being aligned with its leaders, the goal is
-shifted, which costs no energy.
+q and qd are the position and velocity of the follower, v_j the velocity of leader j, and
+alpha_j its dominance factor. Leader j feels -alpha_j F. Two arms that follow each other have
+two couplings. While an arm waits or is being aligned with its leaders, the goal is shifted,
+which costs no energy.
 
-Names: E is a sum of energy that an end has put in or taken out, and W the energy that an end
-may still use. "led" stands for the leader's end and "followed" for the follower's end. The work
-in a control period is the torque times the motion of the joint (`energy` = "step") or times its
-velocity and the period ("velocity", as in the publication of Ryu and others).
+Names: E is the cumulative energy that an end has put in or extracted, and W the energy that an
+end may still use. "led" denotes the leader's end and "followed" the follower's end. The work in
+a control period is the torque times the motion of the joint (`energy` = "step"), or the torque
+times velocity times period ("velocity", as published by Ryu and others).
 
 Invariant:
-    - In each coupling and at each joint, each end adds up the energy that it puts in.
-    - The other end takes no more energy out than it knows to have been put in.
+    - In each coupling and for each joint, each end accumulates the energy that it puts in.
+    - The other end never extracts more energy than it knows to have been put in.
 """
 
 import math
@@ -35,18 +35,16 @@ from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, EnergyLaw
 
 SWEEPS = 3
-"""Number of iterations for the limited torques of joints and couplings, which influence one
-another.
-"""
+"""Number of iterations for the mutually dependent limited torques of joints and couplings."""
 AHEAD = 2.0
-"""Number of ticks of a leader's motion whose energy is set aside in advance.
+"""Number of ticks of a leader's motion for which energy is reserved in advance.
 
-A joint needs one tick to reverse and two to come to rest.
+A joint needs one tick to reverse and two ticks to come to rest.
 """
 SPENT_S = 0.1
 """Time for which the remaining energy lasts at the rate of drift compensation, s."""
 _SLACK_NM = 1e-9
-"""Torque below which a follower's controller does nothing, N m."""
+"""Torque below which a follower's controller does not intervene, N m."""
 
 
 @compiled
@@ -57,21 +55,20 @@ def _book_leader_work(
     torque: float,
     step: float,
 ) -> float:
-    """Adds the work of a leader's arm in one period to the energy account of a coupling.
+    """Adds the work of the leader in one control period to the energy account of a coupling.
 
-    A coupling connects the leader to an arm that follows it. If the work is positive, the arm
-    puts energy into the coupling, and the sum E_led that is sent to the follower grows. If it
-    is negative, the arm takes energy out.
+    If the work is positive, the leader puts energy into the coupling, and the sum E_led that is
+    sent to the follower grows. If it is negative, the leader extracts energy.
 
     Args:
-        now: Inputs and outputs of the law in this control period.
-        j: Index of the peer (the other arm) that follows.
+        now: Inputs and outputs of the law in this tick.
+        j: Index of the peer that follows.
         i: Index of the joint.
         torque: Torque of the coupling, N m.
         step: Motion of the joint, rad.
 
     Returns:
-        The work if the arm takes energy out, J, which is negative. Otherwise 0.
+        The (negative) work if the leader extracts energy, J. Otherwise 0.
     """
     work = torque * step
     input_J = max(work, 0.0)
@@ -82,26 +79,24 @@ def _book_leader_work(
 
 @compiled
 def _observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Updates how much energy the leader's arm may still take out of a coupling.
+    """Updates the energy that the leader may still extract from a coupling.
 
-    A coupling connects the leader to an arm that follows it. The leader feels a torque of the
-    coupling. It may take out only energy that the follower has put into the coupling:
+    The leader may extract only energy that the follower has put into the coupling:
 
         W_led = reserve + E_followed + (sum of the work of the leader where it is negative)
 
-    W_led is the energy that the leader may still take out (the result), J. E_followed is the
-    sum of all energy that the follower has put in, as its messages report it. It grows from
-    period to period, and only the growth since the previous period is added here. If the work
-    is computed from the motion of the arm (`energy` = "step"), this function also adds the work
-    of the previous period, because the motion is known only now. Otherwise the work of each
-    period is added in that period, by `Tdpa.torque`.
+    W_led (the result) is the energy that the leader may still extract, J. E_followed is the
+    total energy put in by the follower, as reported in its messages; only its increase since
+    the previous tick is added here. If work is computed from the motion of the arm (`energy` =
+    "step"), this function also adds the work of the previous control period, because the motion
+    is known only now. Otherwise `Tdpa.torque` adds the work of each period in that period.
 
     Args:
-        law: The law. `law.E_known` is the last report of the follower, which is updated, and
-            `law.F_led` the torque that the leader felt in the previous period, N m.
-        now: Inputs and outputs of the law in this period. W_led is stored in the message to the
-            follower, which keeps the value of the previous period until then.
-        j: Index of the peer (the other arm) that follows.
+        law: The law. `law.E_known`, the last report of the follower, is updated. `law.F_led` is
+            the torque that the leader felt in the previous control period, N m.
+        now: Inputs and outputs of the law in this tick. W_led is stored in the message to the
+            follower, which still contains the value of the previous tick.
+        j: Index of the peer that follows.
         i: Index of the joint.
     """
     index = j * now.joints + i  # position in lists with one entry per coupling and joint
@@ -125,11 +120,11 @@ def _observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
 
 @compiled
 def _invert_inertia(law: Any, now: LawInput) -> None:
-    """Computes the inverse of the arm's inertia matrix M, to predict how torques move the arm.
+    """Computes the inverse of the arm's inertia matrix M, used to predict the motion.
 
-    The result is written to `law.inverse`, row by row. The method is Gauss-Jordan elimination
-    in place: column p of the inverse replaces column p of M. If the arm's parameters are
-    unknown, M is zero, and so is the result.
+    The result is written into `law.inverse`, row by row. Gauss-Jordan elimination is done in
+    place: column p of the inverse replaces column p of M. If the arm's parameters are unknown,
+    M is zero, and so is the result.
     """
     n = now.joints
     inverse = law.inverse
@@ -156,22 +151,22 @@ def _invert_inertia(law: Any, now: LawInput) -> None:
 
 @compiled
 def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Limits the torque that the leader of a coupling feels, so that its energy is covered.
+    """Limits the torque that the leader of a coupling feels to what the known energy covers.
 
-    The coupling connects this arm, the leader, to follower j. The torque of the follower is
-    reduced to a magnitude whose work the known energy covers during the next `AHEAD` ticks
-    (control periods). The prediction assumes that the joint continues its motion, and adds the
-    effect of the torques that change in this tick, the coupling's own torque included. An
-    energy deficit is repaid by damping.
+    The coupling connects this arm (the leader) to follower j. The torque of the follower is
+    reduced such that the known energy covers its work during the next `AHEAD` ticks. The
+    prediction assumes that the joint continues its motion, and includes the effect of the
+    torques that change in this tick, including the torque of the coupling itself. An energy
+    deficit is repaid by damping.
 
-    With m the magnitude of the torque, the predicted cost is
+    If m is the magnitude of the torque, the predicted cost is
 
         m (free_step + step_per_torque m)
 
-    where free_step is the motion of the joint against the torque, if this torque did not act.
+    where free_step is the motion of the joint against the torque if the torque did not act.
 
     Args:
-        law: The law, whose torque F_now of the coupling is written.
+        law: The law; its coupling torque F_now is written.
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer that follows.
         i: Index of the joint.
@@ -240,19 +235,18 @@ def _limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
 def _find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     """Returns the energy that may still be used to move the follower in one coupling, J.
 
-    A coupling connects a leader to this arm, its follower. The known energy is
+    The known energy is
 
         E_led + reserve / 2 - E_moved + E_yielded
 
-    E_led is the energy that the leader is known to have put in, E_moved the energy that moved
-    the follower, and E_yielded the energy that was saved when the controller reduced the
-    velocity. The other half of the initial reserve is kept for periods that cost more than
-    predicted.
+    E_led is the energy that the leader is known to have put in, E_moved the energy used to move
+    the follower, and E_yielded the energy saved when the controller reduced the velocity. The
+    other half of the initial reserve is kept for periods that cost more than predicted.
 
     Args:
         law: The law, with its energy accounts.
-        now: Inputs and outputs of the law in this control period.
-        j: Index of the peer (the other arm) that is followed.
+        now: Inputs and outputs of the law in this tick.
+        j: Index of the peer that is followed.
         i: Index of the joint.
     """
     index = j * now.joints + i
@@ -275,29 +269,29 @@ def _limit_follower_velocity(
 ) -> float:
     """Reduces the velocity of a followed peer if the known energy does not cover its work.
 
-    This arm follows a peer, another arm, by a spring and a damper whose goal moves with the
-    velocity of the peer. If the goal moves with the velocity v during a period h, the force F
-    of spring and damper does the work F v h. This work must not exceed the known energy: the
-    energy that the peer is known to have put in and that is not spent (`_find_known_energy`).
-    If the work is too large, the velocity is reduced so that it equals the known energy:
+    This arm follows a peer through a spring and a damper whose goal moves at the velocity of
+    the peer. If the goal moves at the velocity v during a period h, the force F of the spring
+    and damper does the work F v h. This work must not exceed the known energy, which the peer
+    is known to have put in and which has not been spent (`_find_known_energy`). Otherwise, the
+    velocity is reduced until the work equals the known energy:
 
         F v_reduced h = known energy,    v_reduced = v + (known energy - F v h) / (F h)
 
-    The velocity is stored as `law.v_led`; later it moves the goal.
+    The velocity is stored as `law.v_led`, with which the goal is moved later.
 
     Args:
         law: The law. `law.v_led` is written. If `law.controlled` is False, for comparisons, no
             velocity is reduced.
-        now: Inputs and outputs of the law in this control period.
+        now: Inputs and outputs of the law in this tick.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: F, the part of the torque of spring and damper that belongs to this peer, N m.
-        price: Energy that this period is expected to need besides F v h, J. It is set aside
-            first, if work is computed from the motion of the arm (`law.by_step`).
+        force: F, this peer's part of the torque of the spring and damper, N m.
+        price: Energy expected to be needed in this period in addition to F v h, J. It is
+            reserved first if work is computed from the motion of the arm (`law.by_step`).
 
     Returns:
-        The known energy that remains, J. It is negative if the unreduced velocity of the peer
-        costs more than is known.
+        The remaining known energy, J. Negative if the unreduced velocity of the peer costs more
+        than the known energy.
     """
     index = j * now.joints + i  # position in lists with one entry per coupling and joint
     h = now.h_s
@@ -325,19 +319,19 @@ def _compute_drift_velocity(
 ) -> float:
     """Returns the velocity that moves the goal back to the peers, within the available energy.
 
-    A spring and a damper pull the arm to this goal. It moves with the velocities of the peers
-    (the arms that are followed), which may have been reduced, and so drifts away from their
-    position. The correction moves the goal for all peers together, so the work of the whole
-    torque counts. If work is computed from motion (`law.by_step`), the reactions of the damper
-    and the spring count too, including those to the velocities of the peers. The power of a
-    correction with speed v is linear v + square v^2.
+    The goal, towards which a spring and a damper pull the arm, moves at the velocities of the
+    followed peers. Because these may have been reduced, the goal drifts away from the peers'
+    position. The correction applies to all peers together, so the work of the total torque
+    counts. If work is computed from motion (`law.by_step`), the reactions of the damper and the
+    spring are included, also those to the velocities of the peers. The power of a correction at
+    speed v is linear v + square v^2.
 
     Args:
         law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
         i: Index of the joint.
         error: Difference between the peers' position and the goal, rad.
-        available_J: Energy that remains in all couplings together, J.
+        available_J: Total energy remaining in all couplings, J.
 
     Returns:
         The velocity, rad/s.
@@ -382,20 +376,21 @@ def _find_affordable_velocity(
 ) -> float:
     """Returns the largest velocity of a followed peer that the known energy covers, rad/s.
 
-    The peer is another arm. Its velocity moves the goal to which a spring pulls this arm, and
-    the torque of the spring does work. Delays could make this work larger than the energy that
-    the peer has put in. The arms would then be driven by energy from nowhere. Therefore the
-    velocity is reduced if its work would exceed the energy that the peer is known to have put
-    in and that is not spent (`_find_known_energy`).
+    The velocity of the peer moves the goal towards which a spring pulls this arm, and the
+    torque of the spring does work. Because of delays, this work could exceed the energy that
+    the peer has put in, and energy would be created. The velocity is therefore reduced if its
+    work would exceed the energy that the peer is known to have put in and that has not been
+    spent (`_find_known_energy`).
 
     Args:
-        law: The law. `law.v_led` is the velocity of the peer, which may have been reduced
-            before, in rad/s. If `law.controlled` is False, for comparisons, it is returned.
-        now: Inputs and outputs of the law in this control period.
+        law: The law. `law.v_led` is the velocity of the peer, which may already have been
+            reduced, in rad/s. If `law.controlled` is False, for comparisons, it is returned
+            unchanged.
+        now: Inputs and outputs of the law in this tick.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: Torque of spring and damper at the joint, N m. The weight `alpha`, with which
-            this arm follows the peer, decides which part of it belongs to the peer.
+        force: Torque of the spring and damper at the joint, N m. The dominance factor `alpha`
+            determines the part that belongs to the peer.
     """
     index = j * now.joints + i  # position in lists with one entry per coupling and joint
     # Work in this period for each rad/s of the velocity, J s/rad. It has the sign of the force.
@@ -417,11 +412,11 @@ def _book_follower(
     force: float,
     drift: float,
 ) -> None:
-    """Enters the energy of one period in the accounts of the coupling to peer j.
+    """Enters the energy of one control period into the accounts of the coupling to peer j.
 
-    The coupling connects this arm, the follower, to the peer that leads it. The accounts are
-    those of the follower's end. The peer's velocity moves the goal of a spring and damper,
-    which pull the arm with the force F. Sums of energy since the start, J:
+    The accounts are those of the follower's end (this arm). The velocity of the leader (the
+    peer) moves the goal of a spring and damper, which pull the arm with the force F. Cumulative
+    energies since the start, J:
 
         E_led        energy that the leader has put into the coupling, as it reports it
         E_moved      energy taken out of the coupling by moving the goal
@@ -432,22 +427,22 @@ def _book_follower(
 
                      W_followed = E_led + reserve - E_moved + E_yielded
 
-    In a period h, a goal with the velocity v takes out F v h, or puts in -F v h if this is
-    negative. There are two forms of the law for v:
+    In a period h, a goal with the velocity v extracts F v h, or puts in -F v h if this is
+    negative. The law has two forms for v:
 
     - If work is computed from motion (`law.by_step`), v is the velocity in use, `law.v_led`,
-      which the controller may have reduced. No energy is saved then.
+      which the controller may have reduced. No energy is saved in this form.
     - In the published law, v is the velocity of the leader. The difference from the velocity in
       use saves F (v - v_led) h.
 
     Args:
-        law: The law; its accounts of the coupling are changed.
+        law: The law; its accounts of the coupling are updated.
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: F, the part of the torque of spring and damper that belongs to the peer, N m.
-        drift: Energy that moving the goal back towards the peers takes from this coupling (the
-            compensation of drift), J. Negative if it returns energy, which stays at this end.
+        force: F, the peer's part of the torque of the spring and damper, N m.
+        drift: Energy that drift compensation (moving the goal back towards the peers) takes
+            from this coupling, J. Negative if it returns energy, which stays at this end.
     """
     index = j * now.joints + i  # position in lists with one entry per coupling and joint
     h = now.h_s
@@ -468,34 +463,34 @@ def _book_follower(
 
 @compiled
 def _charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None:
-    """Subtracts energy that the follower used in the last period from the couplings' accounts.
+    """Charges the couplings for energy that the follower used beyond the prediction.
 
-    Before a control period, each coupling (the connection to an arm that is followed) pays for
-    the predicted work. The true work is known only afterwards:
+    Before a control period, each coupling pays for the predicted work. The actual work is known
+    only afterwards:
 
         unpaid = force (step of the arm) + (growth of the spring's energy) - paid
 
-    where `force` is the torque of spring and damper during the period and `paid` the predicted
-    work. If the result is positive, the arm and its spring received more energy than was paid.
-    The difference is charged to the couplings, in proportion to the weights alpha with which
-    the arm follows its peers. If the result is negative, earlier charges are paid back, up to
-    their total amount.
+    where `force` is the torque of the spring and damper during the period and `paid` the
+    predicted work. If the result is positive, the arm and its spring received more energy than
+    was paid for, and the difference is charged to the couplings in proportion to the dominance
+    factors alpha. If the result is negative, earlier charges are refunded, up to their total
+    amount.
 
-    Accounts of each coupling, J: `E_moved` is the energy taken out so far, and `lent` the part
-    of it that was charged by this function and not paid back. `E_yielded` is the energy saved
-    by slower motion. `E_settled` is the energy taken out on balance, E_moved - E_yielded, now
-    that the true work is known; it is recorded to verify the run.
+    Accounts of each coupling, J: `E_moved` is the energy extracted so far, and `lent` the part
+    of it that was charged by this function and not refunded. `E_yielded` is the energy saved by
+    slower motion. `E_settled` is the net energy extracted, E_moved - E_yielded, based on the
+    actual work; it is recorded to verify the run.
 
-    Nothing is charged in the published form of the law, which computes work by velocity
-    (`law.by_step` is False), nor in the first period.
+    Nothing is charged in the published form of the law, which computes work from velocity
+    (`law.by_step` is False), or in the first tick.
 
     Args:
-        law: The law; its energy accounts are changed. `law.alignment_step` is the motion with
-            which the goal was shifted while the arm is aligned with its leaders, rad. It costs
-            no energy, so the arm's step is measured relative to it.
-        now: Inputs and outputs of the law in this period.
+        law: The law; its energy accounts are updated. `law.alignment_step` is the shift of the
+            goal while the arm is being aligned with its leaders, rad. This shift costs no
+            energy, so the arm's step is measured relative to it.
+        now: Inputs and outputs of the law in this tick.
         i: Index of the joint.
-        spring: Energy in the joint's spring now, J.
+        spring: Current energy of the joint's spring, J.
     """
     q_before = now.q_before[i]
     arm_step = now.q[i] - q_before - law.alignment_step[i]
@@ -524,21 +519,20 @@ def _settle_follower(
     drift_velocity: float,
     available_J: float,
 ) -> None:
-    """Computes the torque of a following joint so that the available energy covers its work.
+    """Computes the torque of a following joint within the available energy.
 
-    The follower is the arm that follows its peers, the other arms, in one coupling each. The
-    torque depends on the velocity with which the spring's goal moves. The velocity depends on
-    the energy, and the energy depends on the torque. Therefore both are computed by a fixed
-    number of iterations (`SWEEPS`), unless work is computed by velocity. Finally, the work is
+    The torque depends on the velocity of the spring's goal, the velocity on the energy, and the
+    energy on the torque. Torque and velocity are therefore computed with a fixed number of
+    iterations (`SWEEPS`), unless work is computed from velocity. Finally, the work is
     subtracted from the energy account of each coupling.
 
     Args:
-        law: The law; its energy accounts, goal and torque are changed.
-        now: Inputs and outputs of the law in this control period.
+        law: The law; its energy accounts, goal and torque are updated.
+        now: Inputs and outputs of the law in this tick.
         i: Index of the joint.
         stretch: Elongation of the spring between the arm and its goal, rad.
         drift_velocity: Velocity of the goal that reduces its distance from the peers, rad/s.
-        available_J: Energy that remains in all couplings together, J.
+        available_J: Total energy remaining in all couplings, J.
     """
     n = now.joints
     h = now.h_s
@@ -595,18 +589,18 @@ def _settle_follower(
 def _follow_peers(law: Any, now: LawInput, i: int) -> None:
     """Computes the torque with which a joint follows its peers, and the motion of its goal.
 
-    A spring and a damper pull the joint to a goal that moves with the velocities of the peers,
-    which are the other arms. The steps are:
+    A spring and a damper pull the joint towards a goal that moves at the velocities of the
+    peers. The steps are:
 
-    1. Compute the torque of spring and damper.
-    2. Subtract energy that the previous period used beyond its prediction.
+    1. Compute the torque of the spring and damper.
+    2. Charge energy that was used in the previous control period beyond the prediction.
     3. Reduce the velocities of the peers until the known energy covers their work.
     4. If energy remains, move the goal back towards the true position of the peers.
     5. Compute the final torque, and move the goal.
 
     Args:
-        law: The law; its energy accounts, goal and torque are changed.
-        now: Inputs and outputs of the law in this control period.
+        law: The law; its energy accounts, goal and torque are updated.
+        now: Inputs and outputs of the law in this tick.
         i: Index of the joint.
     """
     n = now.joints
@@ -696,28 +690,28 @@ def _follow_peers(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Couples arms so that no end of a coupling takes out more energy than was put in.
+    """Couples arms such that no end of a coupling extracts more energy than was put in.
 
-    The method is time-domain passivity control. A spring K and a damper B move each arm towards
+    The method is time-domain passivity control. A spring K and a damper B pull each arm towards
     the integral of the velocities of the arms that it follows, weighted by the dominance
-    factors, and these arms feel the torque of K and B. With K = 0 and B = 0 an arm only leads.
+    factors. These arms feel the torque of K and B. An arm with K = 0 and B = 0 only leads.
 
     Source: Ryu, Artigas and Preusche (2010); for several arms Panzirsch and others (2012).
 
     Attributes:
-        K: Stiffness of the spring by which the site follows, per joint, N m/rad. 0 if the site
-            follows no other site.
+        K: Stiffness of the spring with which the site follows, per joint, N m/rad. 0 if the
+            site follows no other site.
         B: Damping with which the site follows, per joint, N m s/rad.
-        acceleration_rad_s2: Largest change of a joint's acceleration per tick (period of the
-            control loop) for which the leaders' controllers plan, caused by other torques than
-            those of the law. Half of the reserve covers larger changes.
-        drift_rad_s: Largest velocity with which positions that have drifted apart are brought
-            together again. With 0, positions drift.
-        reserve_J: Initial energy of an end per joint and peer, J.
-        energy: How work is computed. "step": energy that the arm receives, torque times the
-            step in q; "velocity": torque times velocity times period, as published.
-        beta: Divisor of the site's torque, dimensionless; it scales the forces that the users
-            feel relative to each other.
+        acceleration_rad_s2: Largest change of a joint's acceleration per tick, due to torques
+            other than those of the law, that the leaders' controllers allow for. Larger changes
+            are covered by half of the reserve.
+        drift_rad_s: Largest velocity used to realign positions that have drifted apart. If 0,
+            drift is not corrected.
+        reserve_J: Initial energy of an end, per joint and peer, J.
+        energy: How work is computed. "step": torque times the change of q, which is the energy
+            that the arm receives. "velocity": torque times velocity times period, as published.
+        beta: Divisor of the site's torque, dimensionless, which scales the forces that the
+            users feel relative to each other.
     """
 
     K: NotNegativeJoints = (100.0,)
@@ -753,20 +747,19 @@ class Tdpa(EnergyLaw):
     tune: ClassVar = {"K": STIFFNESS, "B": DAMPING}
     known_facts: ClassVar = "gravity, and inertia to predict two ticks"
     controlled = True
-    """False switches the controllers off, for comparison: energies are only observed."""
+    """False disables the controllers, for comparison: energies are only observed."""
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: creates its energy accounts and its work space.
+        """Prepares the law before a run by creating its energy accounts and work space.
 
-        This arm has two couplings with each peer, another arm: one as the leader of the peer,
-        and one as its follower. As a follower, the arm is pulled to a moving goal by a spring
-        and a damper. Each end of a coupling keeps an account of the energy that it may take
-        out. Lists with one number per coupling and joint are flat: joint i of peer j has the
-        index j n + i, where n is the number of joints.
+        This arm has two couplings with each peer: one as the leader of the peer, and one as its
+        follower. As a follower, the arm is pulled towards a moving goal by a spring and a
+        damper. Each end of a coupling keeps an account of the energy that it may extract. Lists
+        with one entry per coupling and joint are flat: joint i of peer j has the index j n + i,
+        where n is the number of joints.
 
         Args:
-            facts: Facts about the site (the process that runs the arm) that are known before
-                the run.
+            facts: Facts about the arm and the other arms that are known before the run.
         """
         n = facts.joints
         couplings = n * len(facts.peers)
@@ -807,10 +800,10 @@ class Tdpa(EnergyLaw):
         self.inverse = [0.0] * (n * n)  # inverse of the inertia matrix, row by row
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of a control period, and sends torques and energies to others.
+        """Computes the torque of one tick, and sends torques and energies to the peers.
 
-        The arm first acts as a follower, then as a leader. The torque that it feels as a leader
-        is reduced if the torque of a joint would otherwise exceed its limit.
+        The arm acts first as a follower and then as a leader. The torque that it feels as a
+        leader is reduced if a joint would otherwise exceed its torque limit.
 
         Args:
             now: Inputs and outputs of the law in this tick.
@@ -875,16 +868,16 @@ class Tdpa(EnergyLaw):
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
 
-        A coupling connects an arm to a peer, another arm, which leads or follows. The result
-        contains, for each peer, the energy that this arm put into its two couplings, the energy
-        that it took out, and the energy that it observed. It also contains the energy of the
-        springs and the energy that the arm gave to its controller.
+        For each peer, the result contains the energy that this arm put into the two couplings
+        with this peer, the energy that it extracted, and the energy that it observed. The
+        result also contains the energy of the springs and the energy that the arm supplied to
+        its controller.
 
-        The energies of the follower are one period old, because the work of a period is known
-        only at its end.
+        The energies of the follower lag by one tick, because the work of a control period is
+        known only at its end.
 
         Args:
-            seen: Records of the arm in the run, one per control period.
+            seen: Records of the arm in the run, one per tick.
         """
         gave = []
         took = []
@@ -925,8 +918,8 @@ class Tdpa(EnergyLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user that the dominance factors of an arm have no effect.
 
-        A dominance factor is the weight with which an arm follows another arm. If the stiffness
-        K and the damping B are zero, the arm does not follow the others.
+        This is the case if the stiffness K and the damping B are both zero, because the arm
+        then does not follow the others.
 
         Returns:
             A sentence for the user. Empty if K or B is not zero.
@@ -935,23 +928,23 @@ class Tdpa(EnergyLaw):
         return "" if follows else "with K = 0 and B = 0, an arm does not follow others"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """States under which assumptions the law keeps the session passive.
+        """Returns the assumptions under which the law keeps the session passive.
 
-        Passive means that the law never gives more energy than it received. The law has this
-        property for all gains, delays, lost messages and shares (the weights with which the
-        arms follow each other), so the condition is always met. Only the assumptions differ:
+        Passive means that the law never supplies more energy than it received. The law has this
+        property for all gains, delays, lost messages and dominance factors, so the condition is
+        always satisfied. Only the assumptions differ:
 
-        - With `energy` = "step", work is torque times motion, which is exact. But energy is
-          paid before a tick (a period of the control loop), and the motion in it is predicted.
-          If another torque changes the acceleration, the prediction is wrong, and half of
-          `reserve_J` covers the difference. Changes of up to `acceleration_rad_s2` are planned
-          for.
-        - With `energy` = "velocity", as the law was published, work is torque times velocity
-          times the period h. This leaves out the acceleration qdd within a tick, and with it a
-          work of up to tau qdd h^2 / 2, where tau is the torque.
+        - With `energy` = "step", work is torque times motion, which is exact. However, energy
+          is paid in advance for each control period, based on the predicted motion. If another
+          torque changes the acceleration, the prediction is wrong. Changes of up to
+          `acceleration_rad_s2` are allowed for, and half of `reserve_J` covers the difference
+          beyond that.
+        - With `energy` = "velocity", as in the original publication, work is torque times
+          velocity times the control period h. This neglects the acceleration qdd within a
+          period, and therefore work of up to tau qdd h^2 / 2, where tau is the torque.
 
         Returns:
-            The assumptions as a string, with a condition that holds.
+            A condition that holds, with the assumptions as text.
         """
         passive_coupling = (
             "motion stays bounded (decay is not proved): couplings are passive for any delays, "

@@ -1,12 +1,11 @@
-"""Couples arms by wave variables, so that delays and lost messages cannot create energy.
+"""Couples arms with wave variables: delays and lost messages cannot create energy.
 
-Two sites, the processes that run one arm each, are joined by a virtual line. Instead of force
-and velocity, the two ends of a line exchange waves. The square of a wave is twice a power, so a
-delayed wave is stored energy.
+A virtual line connects two sites. Instead of forces and velocities, the two ends of a line
+exchange waves. A wave w carries the power w^2 / 2, so a delayed wave is stored energy.
 
-For one line and one joint let q and qd be the position and velocity of the arm, b the impedance
-of the line (N m s/rad), c = sqrt(2 b), h the control period, and v the received wave (or its
-substitute, if a message is late). The torque on the arm and the sent wave u are
+For one line and one joint, let q and qd be the position and velocity of the arm, b the
+impedance of the line (N m s/rad), c = sqrt(2 b), h the control period, and v the received wave
+(or its substitute, if a message is late). The torque on the arm and the sent wave u are
 
     without a spring:    torque = c v - b qd
                          u = c step / h - v, sent one period later
@@ -14,21 +13,21 @@ substitute, if a message is late). The torque on the arm and the sent wave u are
     and damper B:        torque = K (q_s - q) + B (rate of q_s - qd)
                          u = v - (c / b) torque
 
-where q_s is the end of the spring that moves with the line, and `step` the motion in a period.
+where q_s is the position of the spring's end at the line, and `step` the motion in one period.
 
 Two accounts limit the energy:
-- W, for each line: energy that has arrived in waves and has not acted on the arm yet.
-- H, for each end: energy that it may put into its lines. It contains the energy taken out of
+- W, for each line: energy that has arrived in waves and has not yet acted on the arm.
+- H, for each end: energy that the end may put into its lines, namely the energy extracted from
   the lines minus the work on the arm.
 
 Without a spring, waves carry b h qd^2 / 4 more energy than the work of the arm, because they
-describe a period that is over. H lends this energy until the arm slows down.
+describe the previous period. H lends this energy until the arm slows down.
 
 Invariant:
-    - An end takes no more energy out of a line than the other end has put in, whatever messages
-      are late or lost. The reception "hold", which serves only for comparisons, is an
-      exception.
-    - An end puts no more energy into its lines than its account H contains.
+    - An end never extracts more energy from a line than the other end has put in, no matter
+      which messages are late or lost. The only exception is the reception mode "hold", which
+      exists for comparisons.
+    - An end never puts more energy into its lines than its account H contains.
 """
 
 import math
@@ -62,17 +61,17 @@ from .conditions import (
 from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
-"""Ways to choose the wave that acts on the arm, see `Wave`.
+"""Ways to choose the wave that acts on the arm. See `Wave`.
 
-`hold` repeats the last wave. It is not passive, and serves only for comparison.
+`hold` repeats the last wave. It is not passive, and exists only for comparison.
 """
 _REPLAY = 0
 _SCALED = 2
 _HOLD = 3
 CONCEALED_S = 0.005
-"""A repeated wave is limited so that the known energy lasts for this time, s."""
+"""Time for which the known energy must last while a wave is repeated, s."""
 STAMP_FILTER_TICKS = 20.0
-"""Time constant of the filtered rate at which stamps advance, ticks."""
+"""Time constant of the filter for the rate at which stamps advance, ticks."""
 
 
 @compiled
@@ -83,21 +82,21 @@ def _replay_wave(
     energy: float,
     h: float,
 ) -> float:
-    """Returns the wave to play so that lost waves are made up for, within the known energy.
+    """Returns the wave to play, which makes up for lost waves within the known energy.
 
-    A wave acts on the arm (is played) like a force that also carries energy. If messages are
-    lost, the arm would end at a wrong position. Later messages contain the integral of all
-    waves, so that the integral of the lost waves is known. The line owes this integral to the
-    arm. The owed integral is played in addition to the wave of this control period, at the mean
-    rate of the lost waves or slower. The known energy is divided evenly over the owed integral:
-    each unit of the integral may cost only its part of the energy.
+    A wave acts on the arm (is played) like a force that also carries energy. If lost messages
+    were ignored, the arm would end at a wrong position. Later messages contain the integral of
+    all waves, from which the integral of the lost waves (the owed integral) is known. It is
+    played in addition to the wave of this tick, at the mean rate of the lost waves or slower.
+    The known energy is distributed evenly over the owed integral: each unit of the integral may
+    use only its share of the energy.
 
     Args:
-        law: The law, whose owed integral and owed time are reduced by the part that is played.
+        law: The law; its owed integral and owed time are reduced by the part that is played.
         index: Index of the line and joint in the law's lists.
-        fresh: The wave that is played anyway, sqrt(W).
-        energy: The known energy that has not been played, J.
-        h: The period, s.
+        fresh: The wave that is played in any case, sqrt(W).
+        energy: The known energy that has not yet been played, J.
+        h: The control period, s.
 
     Returns:
         The sum of `fresh` and the additional wave, sqrt(W).
@@ -130,25 +129,25 @@ def _replay_wave(
 
 @compiled
 def _conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
-    """Returns the wave that acts on the arm in a period in which no message has arrived.
+    """Returns the wave that acts on the arm in a tick in which no message has arrived.
 
-    A wave w in sqrt(W) carries the power w^2 / 2. The previous wave is repeated, but it is
-    limited so that the energy E that has arrived and not been used would last for the time
-    T = `CONCEALED_S`, which means w^2 T / 2 <= E.
+    A wave w in sqrt(W) carries the power w^2 / 2. The previous wave is repeated, but limited
+    such that the unused energy E that has arrived would last for the time T = `CONCEALED_S`,
+    that is, w^2 T / 2 <= E.
 
-    Two accounts of the law concern the missing waves. `owed_U` is the time integral of the
-    waves that were lost and that the arm has yet to receive, sqrt(W) s. The repeated wave
-    replaces a missing one. Therefore its integral w h is subtracted from `owed_U`, so that the
-    arm does not receive it again after a later message has stated the integral of the missing
-    waves. `held_s` is the time for which waves have been repeated since the last message.
+    Two accounts of the law track the missing waves. `owed_U` is the time integral of the lost
+    waves that the arm has yet to receive, sqrt(W) s. Because the repeated wave replaces a
+    missing one, its integral w h is subtracted from `owed_U`. Otherwise, the arm would receive
+    it again after a later message has reported the integral of the missing waves. `held_s` is
+    the time for which waves have been repeated since the last message.
 
-    If lost waves of the same sign are owed from earlier, a part of them is added to the
+    If earlier lost waves of the same sign are still owed, a part of them is added to the
     repeated wave (`_replay_wave`).
 
     Args:
         law: The law, with its accounts.
         index: Index of the line and joint in the law's lists.
-        energy: Energy E that has arrived and not been used, J.
+        energy: Unused energy E that has arrived, J.
         h: Control period, s.
 
     Returns:
@@ -186,17 +185,17 @@ def _receive_wave(
     i: int,
     missed: float,
 ) -> float:
-    """Chooses the wave that acts on the arm in a control period, and accounts for its energy.
+    """Chooses the wave that acts on the arm in one tick, and accounts for its energy.
 
-    The wave comes from one peer (another arm), over a virtual line. The energy of a new sample
-    (message) is added to the line's account W of energy that has arrived. The energy of the
-    wave that acts (is played) moves from W to the account H, the energy that this arm may send.
-    The setting `reception` decides which wave is played if a sample is late or lost.
+    The energy of a new sample is added to the account W of the line, which holds the energy
+    that has arrived. The energy of the wave that acts (is played) is transferred from W to the
+    account H, the energy that this arm may send. The setting `reception` determines which wave
+    is played if a sample is late or lost.
 
     Args:
         law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        j: Index of the peer, the site at the other end of the line.
+        j: Index of the peer at the other end of the line.
         i: Index of the joint.
         missed: Number of samples between the sample in use and the previously used sample. -1
             if there is no new sample.
@@ -276,16 +275,16 @@ def _follow_wave(
     i: int,
     v: float,
 ) -> float:
-    """Computes the torque by which a received wave moves the arm through a spring.
+    """Computes the torque with which a received wave moves the arm through a spring.
 
     The wave moves one end of a spring and damper, and the other end pulls the arm. Part of the
-    wave is reflected; the reflected wave is stored in `now` and will be sent to the peer. The
-    module docstring gives the equations.
+    wave is reflected; the reflected wave is stored in `now` and will be sent to the peer. See
+    the module docstring for the equations.
 
     Args:
-        law: The law; the position of the spring is changed.
-        now: Inputs and outputs of the law in this control period.
-        j: Index of the peer (the other arm) from which the wave came.
+        law: The law; the position of the spring is updated.
+        now: Inputs and outputs of the law in this tick.
+        j: Index of the peer that sent the wave.
         i: Index of the joint.
         v: The wave, sqrt(W).
 
@@ -317,17 +316,17 @@ def _follow_wave(
 
 @compiled
 def _close_wave_period(law: Any, now: LawInput, i: int) -> None:
-    """Updates the energy of this end of the lines after a control period.
+    """Updates the energy account of this end of the lines after a control period.
 
-    The energy H is what this site, the process of one arm, may send to its peers in waves,
-    together with the energy in its springs. The function subtracts the work of the torque on
-    the arm in the previous period. If H then exceeds the energy of the springs and the initial
-    reserve, the dampers have dissipated the excess, and it is removed. In the first period, the
-    function initialises the springs and H.
+    H is the energy that this site may send to its peers in waves, plus the energy in its
+    springs. The work of the torque on the arm in the previous control period is subtracted. If
+    H then exceeds the energy of the springs plus the initial reserve, the excess has been
+    dissipated by the dampers and is removed. In the first tick, the springs and H are
+    initialised.
 
     Args:
         law: The law, with its accounts.
-        now: Inputs and outputs of the law in this period.
+        now: Inputs and outputs of the law in this tick.
         i: Index of the joint.
     """
     H = now.to_all.H
@@ -361,24 +360,24 @@ def _close_wave_period(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 def _send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
-    """Scales down the waves of a joint if the site does not have the energy to send them.
+    """Scales down the waves of a joint if the site lacks the energy to send them.
 
-    A wave u in sqrt(W) that lasts for a control period h carries the energy u^2 h / 2. The
-    site, the process of one arm, keeps an account H of the energy that it may send, J. A part
-    of H is not available: the energy stored in the springs, the energy that the coming period
-    needs (`committed`), and half of the initial reserve. This half is kept because the motion
-    in the coming period is only predicted and may cost more.
+    A wave u in sqrt(W) that lasts for a control period h carries the energy u^2 h / 2. The site
+    keeps an account H of the energy that it may send, J. Part of H is not available: the energy
+    stored in the springs, the energy needed in the next period (`committed`), and half of the
+    initial reserve, which is kept because the predicted motion in the next period may cost more
+    than expected.
 
-    Each message to a peer (another arm) contains the wave u and two sums since the start, from
-    which the peer can learn what lost messages contained: U, the sum of u h in sqrt(W) s, and
-    E, the sum of the energies in J.
+    Each message to a peer contains the wave u and two cumulative sums, from which the peer can
+    recover the contents of lost messages: U, the sum of u h in sqrt(W) s, and E, the sum of the
+    energies in J.
 
     Args:
         law: The law, with its accounts.
-        now: Inputs and outputs of the law in this control period. It contains the waves, which
-            are scaled, and the sums and H, which are updated.
+        now: Inputs and outputs of the law in this tick. The waves are scaled, and the sums and
+            H are updated.
         i: Index of the joint.
-        committed: Energy that the coming period needs for other purposes, J.
+        committed: Energy needed for other purposes in the next period, J.
     """
     h = now.h_s
     H = now.to_all.H
@@ -407,18 +406,17 @@ def _send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
 
 
 def _find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
-    """Returns the impedance that a user stated for the line between two arms.
+    """Returns the impedance that a user has specified for the line between two sites.
 
-    A line is the virtual connection over which two arms exchange waves. The order of the two
-    names does not matter.
+    The order of the two names does not matter.
 
     Args:
-        lines: Impedances by name of the line, for example {"m1-s": 18.0}, N m s/rad.
+        lines: Mapping from line name to impedance, for example {"m1-s": 18.0}, N m s/rad.
         site: Name of the site at one end of the line.
         peer: Name of the site at the other end.
 
     Returns:
-        A number for all joints, or one number per joint. None if no impedance is stated.
+        A scalar for all joints, or one value per joint. None if no impedance is specified.
     """
     name = f"{site}-{peer}"
     reversed_name = f"{peer}-{site}"
@@ -427,34 +425,36 @@ def _find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
 
 @compiled
 class Wave(EnergyLaw):
-    """Couples arms by wave variables, which carry energy along virtual lines between the arms.
+    """Couples arms with wave variables, which carry energy along virtual lines between arms.
 
     At an end without a spring, F = b qd - c v and u = c qd - v with c = sqrt(2 b), where v is
-    the received wave and u the sent wave. An end with K and B follows the line by this spring
-    and damper; with B = b it reflects no waves. Site i follows site j with the weight
-    b_ij / sum_k b_ik, where b_ij is the impedance of the line between them.
+    the received wave and u the sent wave. An end with K and B follows the line through this
+    spring and damper; if B = b, it reflects no waves. The effective weight that site i gives to
+    site j is b_ij / sum_k b_ik, where b_ij is the impedance of the line between them.
 
     Source: Anderson and Spong (1989); Niemeyer and Slotine (1991).
 
     Attributes:
         b: Impedance per joint, N m s/rad.
-        K: Stiffness of the spring by which an end moves its arm, per joint, N m/rad. 0 for an
-            end without a spring.
-        B: Damping beside this spring, per joint, N m s/rad. The value b matches it to the line.
-        lines: Impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad. 0
-            removes a line, and lines that are not named have the impedance b. With "shares",
-            the impedances are chosen so that they give the dominance factors at the start, with
-            the mean b, if these factors are reversible; otherwise all are b. Dominance factors
-            are the weights with which an arm follows its peers, the other arms. They are
-            reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
-        beta: Divisor of the site's torque, dimensionless; it scales the forces that the users
-            feel relative to each other.
-        reception: Selects the wave that acts if samples are late or lost. "replay" repeats the
-            last wave, and makes up for missed waves within the known energy. "zero" drops
-            missed waves, so positions drift. "scaled" continues the last wave times sqrt(1 -
-            T'), where T' is the rate of change of the delay, for delays that vary continuously.
-        reserve_J: Initial energy of an end per joint, J. Each line has the same initial energy
-            for its waves. An end that has less than half of the reserve sends smaller waves.
+        K: Stiffness of the spring through which an end moves its arm, per joint, N m/rad. 0 for
+            an end without a spring.
+        B: Damping in parallel with this spring, per joint, N m s/rad. B = b matches the end to
+            the line.
+        lines: Impedances of individual lines, for all joints, for example { "m1-s" = 18.0 }, N
+            m s/rad. 0 removes a line, and lines that are not listed have the impedance b. With
+            "shares", the impedances are computed from the initial dominance factors, with the
+            mean b, if these factors are reversible; otherwise all impedances are b. Dominance
+            factors alpha_ij are reversible if there are positive weights D_i with D_i alpha_ij
+            = D_j alpha_ji.
+        beta: Divisor of the site's torque, dimensionless, which scales the forces that the
+            users feel relative to each other.
+        reception: Wave that is used when samples are late or lost. "replay" repeats the last
+            wave, and makes up for missed waves within the known energy. "zero" drops missed
+            waves, which makes positions drift. "scaled", for continuously varying delays,
+            continues the last wave times sqrt(1 - T'), where T' is the rate of change of the
+            delay.
+        reserve_J: Initial energy of an end, per joint, J. Each line has the same initial energy
+            for its waves. An end with less than half of the reserve sends smaller waves.
     """
 
     b: PositiveJoints = (10.0,)
@@ -492,11 +492,10 @@ class Wave(EnergyLaw):
     tune: ClassVar = {"b": DAMPING, "K": STIFFNESS}
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: creates the state of the lines, without waves.
+        """Prepares the law before a run by creating the state of its lines, with no waves.
 
-        A line is the virtual connection over which this site exchanges waves with a peer,
-        another site. Lists with one number per line and joint are flat: joint i of peer j has
-        the index j n + i, where n is the number of joints.
+        Lists with one entry per line and joint are flat: joint i of peer j has the index j n +
+        i, where n is the number of joints.
 
         Waves are in sqrt(W): a wave w carries the power w^2 / 2.
 
@@ -518,7 +517,7 @@ class Wave(EnergyLaw):
             else:
                 impedances = np.zeros(n) + line
                 self.impedance += impedances.tolist()
-        # A number in place of the text, because `torque` is compiled.
+        # A number instead of the string, because `torque` is compiled.
         self.playing = RECEPTIONS.index(self.reception)
 
         # Per line and joint.
@@ -548,17 +547,17 @@ class Wave(EnergyLaw):
         self.damped = [0.0] * n  # energy that the dampers have dissipated so far, J
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one control period, and sends waves to the other arms.
+        """Computes the torque of one tick, and sends waves to the other arms.
 
-        The torque is the sum of the effects of all arriving waves. The steps are:
+        The torque is the sum of the torques exerted by all arriving waves. The steps are:
 
-        1. Update the energy account of each joint with the work of the previous period.
+        1. Update the energy account of each joint with the work of the previous control period.
         2. Send the waves of joints without a spring.
         3. Compute the torque that the arriving waves exert on the arm.
-        4. Send the waves of joints with a spring. These depend on the result of step 3.
+        4. Send the waves of joints with a spring, which depend on the result of step 3.
 
         Args:
-            now: Inputs and outputs of the law in this period. The torque is written into
+            now: Inputs and outputs of the law in this tick. The torque is written into
                 `now.tau`.
         """
         n = now.joints
@@ -630,18 +629,17 @@ class Wave(EnergyLaw):
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
 
-        All energies are in J. In the records (one per control period),
+        All energies are in J. The records contain, for each tick:
 
-        - "E" is the energy of all waves so far, sent to or received from a peer (another arm);
-        - "W" is the part of the received energy whose waves have not acted on the arm yet, so
-          that E - W is the energy that was used;
-        - "H" is the energy that this site (the process of the arm) may still send, the energy
-          of its springs included;
-        - "damped" is the energy that the dampers have dissipated, per joint;
-        - "carried" is the part of the torque that compensates gravity, N m. Its work has
-          nothing to do with waves, so it is subtracted from the torque.
+        - "E": the total energy of the waves sent to or received from a peer so far;
+        - "W": the part of the received energy whose waves have not yet acted on the arm, so
+          that E - W is the energy used;
+        - "H": the energy that this site may still send, including the energy of its springs;
+        - "damped": the energy dissipated by the dampers, per joint;
+        - "carried": the part of the torque that compensates for gravity, N m. It is subtracted
+          from the torque, because its work is unrelated to the waves.
 
-        The gain beta divides the torque of the waves. On the side of the waves, the work of the
+        The gain beta divides the torque of the waves. In terms of wave energy, the work of the
         arm is therefore larger by the factor beta.
 
         Args:
@@ -649,8 +647,8 @@ class Wave(EnergyLaw):
 
         Returns:
             The energy sent to each peer (`gave`), the energy used from the peer's waves
-            (`took`), the energy that the arm gave to its controller (`port`), H (`store`), the
-            dissipated energy (`taken`), and W, which the site observed itself (`observed`).
+            (`took`), the energy that the arm supplied to its controller (`port`), H (`store`),
+            the dissipated energy (`taken`), and W, which the site itself observed (`observed`).
         """
         sent_energies = []
         used_energies = []
@@ -677,13 +675,13 @@ class Wave(EnergyLaw):
         )
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
-        """Finds a setting that prevents the use of this law in an experiment.
+        """Finds a setting that prevents the use of this law in a scenario.
 
-        Each line that the settings name must join two arms of the experiment, for example
-        "m1-s". All control loops must have the same rate, because one wave is sent per period.
+        Each line named in the settings, for example "m1-s", must connect two sites of the
+        scenario. All sites must have the same tick rate, because one wave is sent per tick.
 
         Args:
-            rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
+            rates_hz: Mapping from site name to tick rate, in Hz.
 
         Returns:
             The key of the setting and the problem. None if the law can be used.
@@ -710,17 +708,14 @@ class Wave(EnergyLaw):
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:
         """Computes the impedance of each line from the dominance factors of the scenario.
 
-        A line is the virtual connection over which two sites, the processes of one arm each,
-        exchange waves. The dominance factor alpha_ij is the weight with which site i should
-        follow site j. Site i follows site j in proportion to the impedance of their line, so
-        the impedances are
+        Site i follows site j in proportion to the impedance of the line between them. To match
+        the dominance factors alpha_ij, the impedances are set to
 
             b_ij = b D_i alpha_ij / m
 
-        where b is the impedance in the settings, D_i are positive weights with D_i alpha_ij =
-        D_j alpha_ji, and m is the mean of D_i alpha_ij over all pairs of sites. If no weights
-        of this kind exist, all lines get the impedance b. If the user stated impedances, they
-        are kept.
+        where b is the impedance from the settings, D_i are positive weights with D_i alpha_ij =
+        D_j alpha_ji, and m is the mean of D_i alpha_ij over all pairs of sites. If no such
+        weights exist, all lines get the impedance b. Impedances specified by the user are kept.
 
         Args:
             names: Names of the N sites.
@@ -751,21 +746,20 @@ class Wave(EnergyLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:
         """Explains to the user why the dominance factors of a site have no effect.
 
-        A dominance factor ("share") is the weight with which a site, the process of one arm,
-        should follow another site. With this law, the impedances of the lines decide instead:
-        sites i and j exchange waves over a line with the impedance b_ij, and site i follows
-        site j with the weight b_ij / sum_k b_ik. The dominance factors have an effect only if
-        the impedances were computed from them (`resolve_shares`).
+        With this law, the effective weights are determined by the impedances of the lines: if
+        the line between sites i and j has the impedance b_ij, site i follows site j with the
+        weight b_ij / sum_k b_ik. The dominance factors ("shares") have an effect only if the
+        impedances were computed from them (see `resolve_shares`).
 
-        This is possible only if the factors are reversible. With b_ij = D_i alpha_ij, each line
-        must have one impedance for both directions, so positive numbers D_i are needed with
-        D_i alpha_ij = D_j alpha_ji for all sites i and j.
+        This is possible only if the factors are reversible: since b_ij = D_i alpha_ij must be
+        the same in both directions, there must be positive weights D_i with D_i alpha_ij = D_j
+        alpha_ji for all sites i and j.
 
         Args:
             situation: The site, and the dominance factors alpha of the scenario.
 
         Returns:
-            A sentence for the user. Empty if the weights equal the dominance factors.
+            A sentence for the user. Empty if the effective weights equal the dominance factors.
         """
         site = situation.names[situation.site]
         impedances = np.zeros(len(situation.names))
@@ -794,9 +788,7 @@ class Wave(EnergyLaw):
     def find_impedances(self, site: str, peer: str) -> tuple[float, ...]:
         """Returns the impedance of the line between two sites, for each joint, N m s/rad.
 
-        A line is the virtual connection over which two sites, the processes of one arm each,
-        exchange waves. If the settings state no impedance for the line, it is the common
-        impedance `b`.
+        Defaults to the common impedance `b` if the settings specify no impedance for the line.
 
         Args:
             site: Name of the site at one end of the line.
@@ -811,16 +803,14 @@ class Wave(EnergyLaw):
         return tuple(impedances.tolist())
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns gains for the linear analysis that only compensate gravity.
+        """Returns the gains of the gravity compensation for the linear analysis.
 
-        The linear analysis considers small motions around a pose at rest. It knows the law with
-        known parameters (`Law.KNOWN`), whose torque is the gravity torque for the parameters
-        `known` plus springs and dampers, which are left out here. `linear_form` adds the waves,
-        which cause all other torques of this law.
+        The result describes the law with known parameters (`Law.KNOWN`), reduced to the gravity
+        torque, with no springs or dampers. All other torques of this law are caused by waves,
+        which `linear_form` adds.
 
         Args:
-            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
-                their number.
+            theta: The P dynamic parameters of the arm, such as masses, shape (P,).
         """
         # The gravity torque is linear in the parameters: scaled parameters scale the torque
         # by `gravity`, the ratio of the compensated gravity torque to the true one.
@@ -828,18 +818,17 @@ class Wave(EnergyLaw):
         return Gains(Law.KNOWN, known=compensated_parameters.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the torque and the sent waves as functions of motion and received waves.
+        """Returns the torque and the sent waves as linear functions of motion and waves.
 
-        The linear analysis uses them for small motions around a pose at rest. It treats a line,
-        over which two sites exchange waves, as a pure delay in continuous time. No wave is late
-        or lost.
+        The linear analysis uses them for small motions about a resting pose. A line is treated
+        as a pure delay in continuous time, with no late or lost waves.
 
         Args:
             situation: The site, its arm and the other sites.
 
         Returns:
-            The functions as blocks of a matrix. None if some joints have a spring and others do
-            not.
+            The functions, as blocks of a matrix. None if some joints have a spring and others
+            do not.
         """
         has_springs = any(self.K)
         if has_springs and not all(self.K):
@@ -870,14 +859,12 @@ class Wave(EnergyLaw):
         return form
 
     def _add_spring_end(self, form: LinearForm, j: int, state: str, b: Array) -> None:
-        """Adds the equations of a line that pulls the arm by a spring to the linear form.
+        """Adds the equations of a line that pulls the arm through a spring to the linear form.
 
-        A line is the virtual connection over which two sites, the processes of one arm each,
-        exchange waves. The received wave v moves one end of a spring K with a damper B in
-        parallel; q_sd is the position of this end. The other end is the arm with the position q
-        and the velocity qd. With the impedance b of the line and c = sqrt(2 b), the rate of
-        q_sd, the force F of spring and damper, the torque tau on the arm and the sent wave u
-        are
+        The received wave v moves one end of a spring K with a parallel damper B; q_sd is the
+        position of this end. The other end is the arm, with the position q and the velocity qd.
+        With the impedance b of the line and c = sqrt(2 b), the rate of q_sd, the force F of the
+        spring and damper, the torque tau on the arm and the sent wave u are
 
             rate = (c v - K q_sd + K q + B qd) / (b + B)
             F    = K (q_sd - q) + B (rate - qd)
@@ -885,11 +872,11 @@ class Wave(EnergyLaw):
             u    = v - (c / b) F
 
         Each is linear in the four columns v, q_sd, q and qd. A block `form.add(row, column,
-        gain)` says that the row contains gain times the column. The row of a state is its rate;
-        ("from", j) is the wave received from peer j, and ("to", j) the wave sent to it.
+        gain)` adds gain times the column to the row. The row of a state is its rate; ("from",
+        j) is the wave received from peer j, and ("to", j) the wave sent to it.
 
         Args:
-            form: The law's linear form, which is extended.
+            form: The law's linear form; modified.
             j: Index of the peer at the other end of the line.
             state: Name of the state q_sd.
             b: Impedance of the line at each joint, N m s/rad.
@@ -918,10 +905,10 @@ class Wave(EnergyLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the law keeps the coupled arms passive.
 
-        Passive means that they never give more energy than they received. This is true for any
-        delays and lost messages, if persons and environments are passive. The text also states
-        with which weight each arm follows the others. The weights are proportional to the
-        impedances of the lines, the virtual connections over which arms exchange waves.
+        Passive means that they never supply more energy than they received. This is true for
+        any delays and lost messages, provided that operators and environments are passive. The
+        text also states the effective weight that each arm gives to the others, which is
+        proportional to the impedance of the line between them.
 
         Args:
             situation: The site and the other sites.
@@ -943,14 +930,13 @@ class Wave(EnergyLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the settings of this law for one arm, after its gains were tuned.
+        """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
-        The settings form the table [control] of a scenario, the description of an experiment.
-        The damping B is set to the impedance b, with which waves travel between the sites. An
-        arm with B = b absorbs arriving waves, so that they are not reflected again and again.
+        The damping B is set to the impedance b of the lines. An arm with B = b absorbs arriving
+        waves instead of reflecting them.
 
         Args:
-            gains: Tuned gains by name.
+            gains: Mapping from gain name to tuned value.
             site: Facts about the arm for which the table is written.
         """
         return {**gains, "B": gains["b"], "gravity": site.gravity}

@@ -53,7 +53,7 @@ from ..net import (
     decode,
     topics,
 )
-from ..own_code import LawFiles, allow_logged_code, find_user_laws
+from ..own_code import LawFiles, allow_logged_code
 from ..records import NS_PER_S
 from ..results import Result
 from ..scenario import (
@@ -427,7 +427,7 @@ class Log(Result, Mapping[str, SiteLog]):
         This permission also covers analyses that repeat the run, such as twins (copies of the
         run started with a small displacement).
         """
-        return all(law.allowed for law in find_user_laws(self.scenario))
+        return all(law.allowed for law in self.scenario.inspect_user_laws())
 
     @property
     def failed_hands(self) -> list[str]:

@@ -1,14 +1,14 @@
-"""Exchanges messages between the processes of a running session over the network.
+"""Network communication between the processes of a running session.
 
-In a session, several processes each control one robot arm, and other processes record the
-messages or let people take part. For example, the process of a slave arm receives the positions
-of two master arms, typically a thousand times per second. The package contains:
+Several processes of a session each control one robot arm; others record the messages or let
+people take part. For example, the process of a slave arm receives the positions of two master
+arms, typically a thousand times per second. The package contains:
 
 - the network connection: `bus`, `zenoh_bus`, `connection`, `member_keys`;
 - the messages and their encoding: `messages`, `requests`, `wire`, `topics`;
-- the clocks of the machines and their comparison: `clock`, `pinging`, `offset`, `timing`;
-- the common start of all processes: `membership`, `session`, `discovery`;
-- connections of other programs to a session: `arm_client`, `known_sites`, `ros2`.
+- clocks, and the measurement of offsets between them: `clock`, `pinging`, `offset`, `timing`;
+- the synchronised start of all processes: `membership`, `session`, `discovery`;
+- access for programs outside the session: `arm_client`, `known_sites`, `ros2`.
 """
 
 from typing import TYPE_CHECKING

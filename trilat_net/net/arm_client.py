@@ -1,8 +1,7 @@
-"""Connects a program to a site: the driver of a real arm, a dead-man switch, or an operator.
+"""Connects programs to a site: the driver of a real arm, a dead-man switch, or an operator.
 
-A site is a process that computes the torque of one arm. If the arm is external (`plant =
-"external"` in the scenario), its driver sends the measured joint positions to the site, and
-applies the torque that the site publishes:
+If an arm is external (`plant = "external"` in the scenario), its driver sends the measured
+joint positions to the site and applies the torque that the site publishes:
 
     with ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:
         while not client.over:
@@ -11,19 +10,18 @@ applies the torque that the site publishes:
             robot.brake() if tau is None else robot.apply(tau)
             robot.wait()
 
-`SwitchClient` reports whether somebody holds the dead-man switch of such an arm. `Hand` lets a
-person or a program move an arm as its operator. Clients read torques and forces from the
-records that the recorder stores as well. Therefore the log contains exactly what was applied to
-the arm.
+`SwitchClient` reports whether the dead-man switch of such an arm is held. `Hand` lets a person
+or a program move an arm as its operator. Clients read torques and forces from the same records
+that the recorder stores, so the log shows exactly what was applied to the arm.
 
 Invariant:
     - `ArmClient.torque` returns None if no valid torque is available. The arm must then brake.
-    - A client accepts only records that continue those that it has received: from the same
-      process of the site, newer, and not implausibly far in the future. Otherwise a second
-      process of the same name, or a forged message, could move the arm.
-    - While an operator sends no new target, a thread repeats the last message. If no more
-      messages arrive, the site knows that the operator's program has died, and releases the
-      arm.
+    - A client only accepts records from the site process it has been following, and only if
+      they are newer than the previous record and not implausibly far in the future. This
+      prevents a second process with the same name, or a forged message, from moving the arm.
+    - While the operator's target does not change, a thread keeps repeating the last message.
+      When the messages stop, the site concludes that the operator's program has died and
+      releases the arm.
 """
 
 import math
@@ -46,26 +44,27 @@ from .wire import decode, encode, split_states
 from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000
-"""Largest age of a usable record, in ns. If the record is older, the site is late or gone."""
+"""Maximum age of a usable record, in ns. If the newest record is older, the site is late or
+gone.
+"""
 AHEAD_NS = 1_000_000_000
-"""Largest time by which a record may be ahead of its expected time, in ns.
+"""Maximum time by which a record may be ahead of its expected time, in ns.
 
-The expected time of a record is the time of the previous one plus the time between their
+The expected time of a record is the time of the previous record plus the time between their
 arrivals.
 """
 _BRAKE_NS = 100_000_000
-"""Time from a fault, or from the release of the dead-man switch, until the brakes hold, in ns.
-"""
+"""Time from a fault, or the release of the dead-man switch, until the brakes hold, in ns."""
 _HEARTBEAT_S = SILENCE_NS / 4e9
-"""Period with which an operator's last message is repeated, in s."""
+"""Interval at which an operator's last message is repeated, in s."""
 _ACTIONS = {
     TorqueKind.LIVE_TIP: "move",
     TorqueKind.LIVE_JOINT: "turn",
     TorqueKind.LIVE_FORCE: "push",
 }
-"""Name of the method with which an operator of each kind moves an arm."""
+"""Mapping from each kind of operator to the name of the method that moves the arm."""
 _DERIVATIVE_STEP_S = 1e-6
-"""Step of the numerical derivative of the arm's pose, in s."""
+"""Step size of the numerical derivative of the arm's pose, in s."""
 
 
 R = TypeVar("R", bound=DirectMessage)
@@ -74,20 +73,19 @@ R = TypeVar("R", bound=DirectMessage)
 class _SiteSender:
     """Sends numbered messages to one channel of a site.
 
-    A site is a process that runs one arm and its control loop. The messages of a sender are
-    numbered, so that the site detects lost, repeated and reordered messages.
+    The numbers allow the site to detect lost, repeated and reordered messages.
 
     Args:
-        bus: Network connection that reaches the site.
+        bus: Network connection through which the site can be reached.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
-        channel: Channel of the messages, the last part of their key.
+        channel: Channel of the messages (the last part of their key).
         boot: Random number that identifies this start of the sending program.
 
     Attributes:
         boot: Random number that identifies this start of the sending program.
-        number: Number of the newest message, from 0. It is -1 before the first message.
+        number: Number of the newest message, from 0. -1 before the first message.
     """
 
     def __init__(
@@ -99,7 +97,7 @@ class _SiteSender:
         channel: str,
         boot: int,
     ) -> None:
-        """Opens a channel for messages to a site (arm controller). No message is sent yet."""
+        """Opens a channel for messages to a site. No message is sent yet."""
         self.boot = boot
         self.number = -1
         self._clock = clock
@@ -107,13 +105,13 @@ class _SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends a message to an arm controller (site), under the next number.
+        """Sends a message to a site and gives it the next sequence number.
 
         Args:
             kind: Class of the message.
-            **fields: Fields of the message other than the site, the boot and the number. They
-                may replace the time stamp `sent_ns`, which is otherwise the present time of the
-                clock.
+            **fields: Fields of the message other than the site, the boot and the sequence
+                number. Pass `sent_ns` to override the time stamp, which is otherwise the
+                current time.
 
         Returns:
             The message that was sent.
@@ -126,23 +124,22 @@ class _SiteSender:
         return message
 
     def repeat(self, message: R) -> None:
-        """Sends a message again with the same number, to show that the program still runs.
+        """Repeats a message with its original number, showing that the program still runs.
 
-        The site recognises the number, and does not execute the message a second time.
+        The site recognises the number and does not execute the message a second time.
 
         Args:
-            message: Message that `send` has returned.
+            message: A message returned by `send`.
         """
         self._publish(encode(message))
 
 
 class HandSender(_SiteSender):
-    """Sends the messages of an operator to the site of an arm.
+    """Sends an operator's messages to the site of an arm.
 
-    The operator is the person or program that moves the arm. A random number in 1 ... 2^32 - 1
-    identifies the operator's program. The records of the site store this number as a float,
-    which represents such numbers exactly. In a record, the number 0 means that no operator
-    moves the arm.
+    The operator's program is identified by a random number in 1 ... 2^32 - 1, which the records
+    of the site store as a float without loss of precision. In a record, 0 means that no
+    operator is moving the arm.
 
     Args:
         bus: Network connection of the operator's program.
@@ -171,8 +168,8 @@ class HandSender(_SiteSender):
         """Sends a target or a force to the site, or releases its arm.
 
         Args:
-            source: Name of the operator for people.
-            **fields: Further fields of `HandMessage`.
+            source: Name of the operator, as shown to people.
+            **fields: Other fields of `HandMessage`.
 
         Returns:
             The message that was sent.
@@ -181,15 +178,12 @@ class HandSender(_SiteSender):
 
 
 class SiteClient:
-    """Connection of a program to one site, from which it receives records and events.
+    """Receives the records and events of one site.
 
-    The object is a context manager that closes the network connection.
-
-    A site is a process that runs one arm and its control loop. A record is the result of one
-    period of this loop.
+    Use the client as a context manager to close the network connection.
 
     Args:
-        bus: Network connection that reaches the site.
+        bus: Network connection through which the site can be reached.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
@@ -202,7 +196,7 @@ class SiteClient:
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the records, the events and the presence of a site (arm controller)."""
+        """Subscribes to the records, the events and the presence of a site."""
         self._bus = bus
         self._clock = clock
         self._site = site
@@ -225,21 +219,19 @@ class SiteClient:
 
     @property
     def record(self) -> State | None:
-        """Newest record of the arm controller (site) that has arrived, with angles and torque.
+        """Newest record received from the site, which contains the joint angles and the torque.
 
-        A record is the result of one period of the control loop. The value is None before the
-        first record has arrived.
+        None until the first record arrives.
         """
         self._read_messages()
         return self._record
 
     @property
     def fresh(self) -> bool:
-        """True if the newest record can still be used to control the arm.
+        """True if the newest record is recent enough to control the arm.
 
-        This is the case if the record is at most `FRESH_NS` old and the run continues. It is
-        False before the first tick (period of the control loop), after the run, and once the
-        run has diverged.
+        The record must be at most `FRESH_NS` old. False before the first tick, after the end of
+        the run, and once the run has diverged.
         """
         record = self.record
         if record is None or self._is_over or record.mode == "diverged":
@@ -248,20 +240,20 @@ class SiteClient:
 
     @property
     def over(self) -> bool:
-        """True once no more records of the site (arm controller) will arrive.
+        """True once the site will send no more records.
 
-        This is the case if the run of the site has ended, or if its process is gone.
+        Either its run has ended or its process has disappeared.
         """
         self._read_messages()
         return self._is_over
 
     def _is_next_record(self, record: State, received_ns: int) -> bool:
-        """Returns True if a record may follow the newest known one.
+        """Returns True if a record is a valid successor of the newest known one.
 
-        It must come from the same process of the site and be newer. Its time must not be more
-        than `AHEAD_NS` later than the time of the newest record (result of a control period)
-        plus the time since that record arrived. A forged record with a time far in the future
-        would otherwise make the client ignore all correct records.
+        It must come from the same process of the site and be newer. Its time must not exceed
+        the time of the newest record, plus the time since that record arrived, by more than
+        `AHEAD_NS`. Otherwise, a forged record with a time far in the future would make the
+        client ignore all correct records.
 
         Args:
             record: The record.
@@ -280,10 +272,10 @@ class SiteClient:
         return is_newer and is_plausible
 
     def _read_messages(self) -> None:
-        """Receives all waiting messages, and updates the newest record and the end of the run.
+        """Processes all pending messages, and updates the newest record and the end of the run.
 
-        The run of the site (arm controller) has ended if the site has published its end, or if
-        its liveliness token, which exists as long as its process is connected, has disappeared.
+        The run of the site has ended if the site has published its end, or if its liveliness
+        token has disappeared, which happens when its process loses its connection.
         """
         while (message := self._records.poll()) is not None:
             block, received_ns = message
@@ -311,25 +303,22 @@ class SiteClient:
 
 
 class _OutsideClient(SiteClient):
-    """Connection of a program that also sends messages to one channel of a site.
+    """Connects a program that also sends messages to one channel of a site.
 
-    `ArmClient` and `SwitchClient` define the channel. The object is a context manager that
-    closes the network connection.
-
-    A site is a process that runs one arm and its control loop. The channel is one stream of
-    messages to the site, for example that of the measurements of its arm.
+    The channel, for example that of the measurements of an arm, is defined by `ArmClient` and
+    `SwitchClient`. Use the client as a context manager to close the network connection.
 
     Args:
-        bus: Network connection that reaches the site.
+        bus: Network connection through which the site can be reached.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
     """
 
     channel = ""
-    """The last part of the key under which the program publishes."""
+    """Last part of the key under which the program publishes."""
     member = ""
-    """The member whose keys the program uses; "" stands for the site."""
+    """Member whose keys the program uses, or an empty string for the site."""
 
     def __init__(
         self,
@@ -338,7 +327,7 @@ class _OutsideClient(SiteClient):
         session: str,
         site: str,
     ) -> None:
-        """Subscribes to the messages of a site (arm controller), and opens a channel to it."""
+        """Subscribes to the messages of a site, and opens a channel to it."""
         super().__init__(bus, clock, session, site)
         self._sender = _SiteSender(
             bus=bus,
@@ -357,15 +346,15 @@ class _OutsideClient(SiteClient):
         connect: Sequence[str],
         keys: str | Path | None = None,
     ) -> Self:
-        """Connects a program to an arm controller (site) over the network.
+        """Connects a program to a site over the network.
 
         Args:
             session: Name of the session, by default the name of the scenario.
-            site: Name of the site, the process that runs the arm.
+            site: Name of the site.
             connect: Endpoints of the site, which the site prints while it waits for its arm.
-            keys: Folder with the keys of one member, as `trilat keys new` creates it. The
-                program of an arm uses the keys of its site. The program of a dead-man switch
-                uses the keys of the operator. If None, the connection uses no keys.
+            keys: Folder with the keys of one member, as created by `trilat keys new`. An arm's
+                driver uses the keys of the arm's site; the program of a dead-man switch uses
+                the keys of the operator. If None, the connection uses no keys.
 
         Returns:
             The client.
@@ -379,10 +368,10 @@ class _OutsideClient(SiteClient):
 
 
 class SwitchClient(_OutsideClient):
-    """Connection of the program of a dead-man switch to the site of the arm.
+    """Connects the program of a dead-man switch to the site of the arm.
 
-    The program reports regularly whether somebody holds the switch. The arm stops if the switch
-    is released, or if no message has arrived for 100 ms.
+    The program regularly reports whether the switch is held. The arm stops when the switch is
+    released, or when no report has arrived for 100 ms.
 
     >>> endpoints = ["tcp/127.0.0.1:10241"]
     >>> with tn.SwitchClient.connected("two_sites", "s", endpoints) as switch:  # doctest: +SKIP
@@ -393,26 +382,25 @@ class SwitchClient(_OutsideClient):
 
     channel = topics.ENABLE
     member = OPERATOR
-    """Member whose keys the program uses. Empty stands for the site."""
+    """Member whose keys the program uses, or an empty string for the site."""
 
     def send(self, *, held: bool) -> None:
-        """Reports to the site whether somebody holds the dead-man switch.
+        """Reports to the site whether the dead-man switch is held.
 
-        The program of the switch must report at least every 100 ms, because the arm stops
-        otherwise.
+        Call this at least every 100 ms; otherwise the arm stops.
 
         Args:
-            held: True while somebody holds the switch. False stops the arm at once.
+            held: True while the switch is held. False stops the arm at once.
         """
         self._sender.send(ArmEnable, held=held)
 
 
 class ArmClient(_OutsideClient):
-    """Connection of the driver of an external arm to the site that controls the arm.
+    """Connects the driver of an external arm to the site that controls the arm.
 
-    The driver sends measurements with `send`, and reads the torque to apply with `torque`. The
-    attribute `record` is the newest record of the site, the result of one period of its control
-    loop. The object is a context manager that closes the network connection.
+    The driver sends measurements with `send` and reads the torque to apply with `torque`. The
+    attribute `record` holds the newest record of the site. Use the client as a context manager
+    to close the network connection.
 
     >>> endpoints = ["tcp/127.0.0.1:10241"]
     >>> with tn.ArmClient.connected("two_sites", "s", endpoints) as client:  # doctest: +SKIP
@@ -421,7 +409,7 @@ class ArmClient(_OutsideClient):
     """
 
     channel = topics.MEASURED
-    """Channel of the messages, the last part of their key."""
+    """Channel of the messages (the last part of their key)."""
 
     def send(
         self,
@@ -430,19 +418,19 @@ class ArmClient(_OutsideClient):
         tau_x: Sequence[float] = (),
         stamp_ns: int | None = None,
     ) -> None:
-        """Sends a measurement of a real arm, such as its joint angles, to its controller.
+        """Sends measured joint angles (rad) and velocities (rad/s) of a real arm to its site.
 
         Args:
             q: Joint angles in rad.
             qd: Joint velocities in rad/s.
-            tau_x: Torque of the operator and the environment in N m per joint, if the arm
-                measures it. The sign is that of the paper: the torque that acts ON the arm is
-                the negative of `tau_x`.
+            tau_x: Torque exerted by the operator and the environment, in N m per joint, if the
+                arm measures it. The sign convention is that of the paper: `tau_x` is the
+                negative of the torque that acts ON the arm.
             stamp_ns: Time of the measurement in ns, on any monotonic clock of the arm. If None,
-                the present time of this program's monotonic clock is used.
+                the current time of this program's monotonic clock is used.
 
         Raises:
-            ValueError: `tau_x` and `q` have different lengths, or a number is not finite.
+            ValueError: `tau_x` and `q` have different lengths, or a value is not finite.
         """
         vectors = {"q": q, "qd": qd, "tau_x": tau_x}
         vectors_by_name = {
@@ -452,19 +440,16 @@ class ArmClient(_OutsideClient):
         self._sender.send(ArmMeasurement, **vectors_by_name, **optional_stamp)
 
     def torque(self) -> tuple[float, ...] | None:
-        """Returns the torque to apply now, or None if the arm must brake.
+        """Returns the torque to apply now, in N m per joint, or None if the arm must brake.
 
-        The torque is that of the newest record, the result of one tick (period of the control
-        loop) of the site (arm controller). The arm must brake in these cases:
+        The torque is taken from the newest record of the site. The arm must brake in these
+        cases:
 
-        - before the first tick and after the run,
+        - before the first tick and after the end of the run,
         - if the newest record is older than `FRESH_NS`,
-        - `_BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
-          torque brings the arm to rest. If the switch is released while the arm is stopped by
-          order, this time counts from the stop.
-
-        Returns:
-            The torque in N m per joint. None if the arm must brake.
+        - `_BRAKE_NS` after a fault or after the release of the dead-man switch. Until then, the
+          torque brings the arm to rest. If the arm had already been stopped by a command when
+          the switch was released, this time is measured from the stop.
         """
         record = self.record
         if record is None or not self.fresh:
@@ -490,24 +475,23 @@ class ArmClient(_OutsideClient):
 
 
 class Hand(SiteClient):
-    """Connection of a person or a program that moves an arm as its operator.
+    """Lets a person or a program move an arm as its operator.
 
-    `tn.hand` and the commands of the live page create it. The first call of `move`, `turn` or
-    `push` starts to move the arm. Which of them is permitted depends on whether the operator in
-    the scenario has a target position, target angles, or a force. `release` ends the operator's
-    influence. The object is a context manager that releases the arm at its end.
+    Instances are created by `tn.hand` and by the commands of the live page. The first call to
+    `move`, `turn` or `push` takes hold of the arm. Which of the three is allowed depends on
+    whether the scenario gives the operator a target position, target angles or a force.
+    `release` lets go of the arm. When used as a context manager, the arm is released on exit.
 
     Args:
         bus: Network connection.
         clock: Clock of this process.
         session: Name of the session.
         site: Site of the arm.
-        operator: Settings of the live operator in the scenario, as the simulation kernel stores
-            them.
-        compute_pose: Function that returns the arm's pose for given joint angles, in the
+        operator: Settings of the scenario's live operator, as stored by the simulation kernel.
+        compute_pose: Function that computes the arm's pose from its joint angles, in the
             coordinates of the operator's target: the position of the end effector in m, or the
             joint angles in rad.
-        source: Name of the person or program, which events of the session mention.
+        source: Name of the person or program, which is mentioned in the events of the session.
         repeats: True if a thread repeats the last message. Without the thread, the site
             releases the arm if the program hangs.
     """
@@ -524,7 +508,7 @@ class Hand(SiteClient):
         *,
         repeats: bool = True,
     ) -> None:
-        """Connects to a site (arm controller). The arm moves only after a further call."""
+        """Connects to a site. The arm does not move until a method such as `move` is called."""
         super().__init__(bus, clock, session, site)
         self._operator = operator
         self._compute_pose = compute_pose
@@ -542,8 +526,8 @@ class Hand(SiteClient):
     def __exit__(self, *_: object) -> None:
         """Releases the arm, and waits until its record shows that nobody holds it any more.
 
-        The wait takes at most twice the time in which the grip fades, even if no record (result
-        of a control period) arrives. The bus stays open, because the caller opened it.
+        The wait takes at most twice the time in which the grip fades, even if no record
+        arrives. The bus stays open, because it was opened by the caller.
         """
         try:
             self.release()
@@ -554,23 +538,23 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Pulls the end effector of the arm towards a target position, like a spring.
+        """Pulls the end effector towards a target position in m, like a spring.
 
         Args:
-            *place_m: Coordinates x and y of the target, for an arm in space also z, in m.
+            *place_m: Coordinates of the target in m: x and y, plus z for an arm in space.
 
         Returns:
-            The number of the message. The property `number` has this value once the site (arm
-            controller) follows the message.
+            The number of the message. The property `number` changes to this value once the site
+            follows the message.
 
         Raises:
-            UsageError: The scenario's operator is not moved in this way, or a number is not
-                finite.
+            UsageError: The scenario's operator cannot be moved in this way, or a coordinate is
+                not finite.
         """
         return self._send("move", place_m)
 
     def turn(self, *angles_rad: float) -> int:
-        """Pulls the joints of the arm towards target angles, like springs.
+        """Pulls the joints of the arm towards target angles in rad, like springs.
 
         Args:
             *angles_rad: Target angle of each joint, in rad.
@@ -579,30 +563,30 @@ class Hand(SiteClient):
             The number of the message, see `move`.
 
         Raises:
-            UsageError: The scenario's operator is not moved in this way, or a number is not
+            UsageError: The scenario's operator cannot be moved in this way, or an angle is not
                 finite.
         """
         return self._send("turn", angles_rad)
 
     def push(self, *force_n: float) -> int:
-        """Pushes the end effector of the arm with a force, as a person would with a hand.
+        """Pushes the end effector of the arm with a force in N, as a person's hand would.
 
         Args:
-            *force_n: Coordinates of the force that acts ON the end effector, in N.
+            *force_n: Components of the force that acts ON the end effector, in N.
 
         Returns:
             The number of the message, see `move`.
 
         Raises:
-            UsageError: The scenario's operator does not apply forces, or a number is not
+            UsageError: The scenario's operator does not apply forces, or a component is not
                 finite.
         """
         return self._send("push", force_n)
 
     def release(self) -> None:
-        """Stops moving the arm. The force on it fades within 100 ms, so that it does not jump.
+        """Lets go of the arm. The force fades within 100 ms, to avoid a sudden movement.
 
-        Afterwards, `move`, `turn` or `push` may take hold of the arm again.
+        `move`, `turn` or `push` can take hold of the arm again.
         """
         with self._lock:
             is_gripping = self._message is not None
@@ -612,20 +596,19 @@ class Hand(SiteClient):
 
     @property
     def holds(self) -> bool:
-        """True if this program moves the arm, as its operator, in the newest record.
+        """True if, according to the newest record, this program is the operator moving the arm.
 
-        A record contains the state of the site in one period of its control loop. The value is
-        False if another operator or nobody moves the arm, or if there is no record yet.
+        False if another operator or nobody is moving the arm, or if no record has arrived yet.
         """
         hand = self.in_force
         return hand is not None and hand.source == self._sender.boot
 
     @property
     def number(self) -> int:
-        """Number of the message from this program that the arm followed in its newest record.
+        """Number of this program's message that the arm followed in the newest record.
 
-        It is the number that `move`, `turn` or `push` returned, or -1 if this program does not
-        move the arm at present.
+        Matches the number returned by `move`, `turn` or `push`. -1 if this program is not
+        moving the arm.
         """
         hand = self.in_force
         if hand is None or hand.source != self._sender.boot:
@@ -634,11 +617,10 @@ class Hand(SiteClient):
 
     @property
     def in_force(self) -> HandInForce | None:
-        """Operator who moves the arm in the newest record, with the present target or force.
+        """The operator moving the arm in the newest record, with the current target or force.
 
-        A record contains the state of the site in one period of its control loop. The operator
-        may be this program or another program. The value is None if nobody moves the arm, or if
-        there is no record yet.
+        The operator may be this program or another one. None if nobody is moving the arm, or if
+        no record has arrived yet.
         """
         record = self.record
         if record is None or not record.hand:
@@ -647,25 +629,25 @@ class Hand(SiteClient):
 
     @property
     def pose(self) -> tuple[float, ...]:
-        """Pose of the arm in the newest received record.
+        """Pose of the arm in the newest record received.
 
-        It is the position of the end effector in m, or for `turn` the joint angles in rad.
+        This is the position of the end effector in m or, for `turn`, the joint angles in rad.
         """
         record = self._wait_for_record()
         return tuple(map(float, self._compute_pose(record.q)))
 
     @property
     def force(self) -> tuple[float, ...]:
-        """Force of the operator ON the arm in the newest record, in N.
+        """Force that the operator exerts ON the arm in the newest record, in N.
 
-        For `turn`, these are the torques on the joints in N m.
+        For `turn`, these are joint torques in N m.
 
         An operator with a target pulls the arm like a spring and a damper,
 
             F = K (target - pose) + B (target rate - pose rate).
 
-        The force is limited in size, and scaled by the grip between 0 and 1. The operator feels
-        the negative of this force.
+        The magnitude of the force is limited, and the force is scaled by the grip (0 to 1). The
+        operator feels the negative of this force.
         """
         record = self._wait_for_record()
         operator = self._operator
@@ -689,15 +671,14 @@ class Hand(SiteClient):
         return tuple(scale * component for component in pull)
 
     def _compute_pose_rate(self, record: State) -> list[float]:
-        """Returns the velocity of the end effector, or of the angles that the operator turns.
+        """Returns the velocity of the end effector (m/s) or of the turned joint angles (rad/s).
 
-        It is computed as a central difference, because only a function for the pose is known:
-        the pose is evaluated a little later and a little earlier along the measured joint
-        velocities, and the difference is divided by the time between the two.
+        Because only a function for the pose is known, the velocity is computed as a central
+        difference: the pose is evaluated slightly later and slightly earlier along the measured
+        joint velocities, and the difference is divided by the time between the two.
 
         Args:
-            record: Record (result of a control period) of the site (arm controller), with
-                angles and velocities of the joints.
+            record: Record of the site, with angles and velocities of the joints.
 
         Returns:
             The rate of each coordinate of the pose, m/s or rad/s.
@@ -710,7 +691,7 @@ class Hand(SiteClient):
         return [(later - earlier) / (2.0 * step_s) for later, earlier in pairs]
 
     def _wait_for_record(self) -> State:
-        """Returns the newest record of the site (arm controller), and waits for the first one.
+        """Returns the newest record of the site, waiting for the first one if necessary.
 
         Raises:
             UsageError: The run has ended before the first record.
@@ -722,14 +703,15 @@ class Hand(SiteClient):
         return record
 
     def _send(self, action: str, numbers: Sequence[float]) -> int:
-        """Sends a target or force to the arm controller, and returns the message's number.
+        """Sends a target or force to the site, and returns the number of the message.
 
         Args:
             action: Name of the method that the program called: "move", "turn" or "push".
             numbers: Coordinates of the target or the force.
 
         Raises:
-            UsageError: The scenario's operator has another kind, or a number is not finite.
+            UsageError: The scenario's operator is of another kind, or a coordinate is not
+                finite.
         """
         permitted_action = _ACTIONS[self._operator.kind]
         if action != permitted_action:
@@ -739,17 +721,17 @@ class Hand(SiteClient):
             )
         coordinates = [float(number) for number in numbers]
         if not all(map(math.isfinite, coordinates)):
-            raise UsageError(f"the numbers of {action} must be finite, not {coordinates}")
+            raise UsageError(f"the coordinates of {action} must be finite, not {coordinates}")
         field = "force" if permitted_action == "push" else "target"
         with self._lock:
             self._message = self._sender.move(self._source, **{field: coordinates})
             return self._sender.number
 
     def _repeat_messages(self) -> None:
-        """Repeats the last message while the program holds the arm, in a thread of its own.
+        """Repeats the last message while the program holds the arm, in a separate thread.
 
-        Without the repeated messages, the site would assume that a program without a new target
-        has died, and would release the arm. The thread ends when the object is closed.
+        Otherwise, the site would assume that a program that sends no new target has died, and
+        would release the arm. The thread ends when the object is closed.
         """
         while not self._ended.wait(_HEARTBEAT_S):
             with self._lock:

@@ -1,18 +1,18 @@
-"""Defines the interface of a process's network connection, and the queues of waiting messages.
+"""Defines the network connection of a process, and the queues for its incoming messages.
 
 The control loop of an arm must never wait for the network, and should spend little time on it.
-The network connection, the `Bus`, therefore puts arriving messages into queues, from which the
-loop removes them when it has time. It also publishes messages under keys, and sends and answers
-queries. `zenoh_bus` implements the interface over Eclipse Zenoh. Tests implement it within one
+The network connection (`Bus`) therefore puts incoming messages into queues, which the loop
+reads when it has time. A bus also publishes messages under keys, and sends and answers queries.
+`zenoh_bus` implements the interface with Eclipse Zenoh; the tests implement it within a single
 process.
 
 Invariant:
-    - When a message arrives, the network thread only reads the time, decodes the message and
+    - When a message arrives, the network thread only reads the clock, decodes the message and
       appends it to a queue, or sends a short reply.
     - Messages wait in queues of limited length until the control loop polls them. If a queue is
-      full, the oldest message is dropped. The receiver notices the gap because messages are
-      numbered.
-    - Only the recorder receives messages by a callback (`Bus.tap`).
+      full, the oldest message is dropped. The receiver detects the gap from the message
+      numbers.
+    - Only the recorder receives messages through a callback (`Bus.tap`).
 """
 
 import re
@@ -22,48 +22,47 @@ from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
 RING_CAPACITY = 16_384
-"""Number of messages that a queue holds: those of one peer in sixteen seconds at 1 kHz."""
+"""Number of messages that a queue can hold: those of one peer in sixteen seconds at 1 kHz."""
 
 T = TypeVar("T")
 Polled = TypeVar("Polled", covariant=True)
 
 
 class PolledRing(Protocol[Polled]):
-    """Interface of a queue of limited length, from which entries are removed one by one.
+    """Interface of a bounded queue that is read one entry at a time, without waiting.
 
-    A control loop reads the messages that have arrived from such queues, because reading them
-    never waits. `BoundedRing` and the queues of Zenoh implement this interface.
+    Control loops read incoming messages from such queues. `BoundedRing` and the queues of Zenoh
+    implement this interface.
     """
 
     def poll(self) -> Polled | None:
-        """Removes the oldest received message from the queue and returns it, without waiting.
+        """Removes and returns the oldest message, or returns None if the queue is empty.
 
-        Returns:
-            The message. None if the queue is empty.
+        Never waits.
         """
 
 
 Inbox = PolledRing[tuple[str, bytes]]
-"""Queue of messages: the key and the payload of each message."""
+"""Queue of messages, each given by its key and payload."""
 PresenceInbox = PolledRing[tuple[str, bool]]
-"""Queue of changes of presence: the key of a token, and True if the token has appeared."""
+"""Queue of presence changes: the key of a token, and True if the token has appeared."""
 StampedInbox = PolledRing[tuple[Polled, int]]
 """Queue of decoded messages, each with its time of arrival in ns."""
 
 
 class Query(Protocol):
-    """Interface of a query that has arrived over the network, and that waits for a reply.
+    """Interface of a query that has arrived over the network and is waiting for a reply.
 
-    A member (process that takes part in a session) sends a query under a key, a text that names
-    the receivers. Each receiver can reply with one payload of bytes.
+    A member sends a query under a key that selects the receivers. Each receiver can reply once,
+    with a payload of bytes.
     """
 
     @property
     def payload(self) -> bytes:
-        """Content of a request, as its sender encoded it. Empty if it has no content."""
+        """Content of the query, as encoded by its sender. Empty if the query has no content."""
 
     def reply(self, payload: bytes) -> None:
-        """Sends the answer to the member that asked. A query can be answered once.
+        """Sends a reply to the member that made the query. A query can be answered only once.
 
         Args:
             payload: The encoded reply.
@@ -75,12 +74,12 @@ QueryInbox = PolledRing[Query]
 
 
 class Bus(Protocol):
-    """Interface of the network connection of a member, a process that takes part in a session.
+    """Interface of a member's connection to the network.
 
-    All messages, queries and signs of life of a member pass through one such connection. A
-    message is a payload of bytes under a key, which is a text of parts between slashes. Keys
-    that are passed for receiving may contain wildcards: `*` stands for one part, and `**` for
-    any number of parts. `ZenohBus` implements this interface for a real network.
+    All messages, queries and liveliness tokens of a member pass through one connection. A
+    message is a payload of bytes published under a key, which is a string of parts separated by
+    slashes. Keys used for receiving may contain wildcards: `*` matches one part, and `**` any
+    number of parts. `ZenohBus` implements this interface for a real network.
     """
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
@@ -88,9 +87,9 @@ class Bus(Protocol):
 
         Args:
             key: The key, without wildcards.
-            patient: False if a payload is dropped when the network is too slow. True if the
-                function waits instead, for some seconds at most. Senders that have no control
-                loop and must not lose messages use True.
+            patient: If False, a payload is dropped when the network cannot keep up. If True,
+                the function waits instead, for a few seconds at most. Use True for senders that
+                have no control loop and must not lose messages.
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
@@ -98,8 +97,8 @@ class Bus(Protocol):
 
         Args:
             key: The key, which may contain wildcards.
-            capacity: Number of messages that the queue holds. If it is full, the oldest message
-                is dropped.
+            capacity: Number of messages that the queue can hold. If it is full, the oldest
+                message is dropped.
         """
 
     def stamped_inbox(
@@ -109,18 +108,18 @@ class Bus(Protocol):
         read: Callable[[bytes], T],
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """Returns a queue whose messages are decoded on arrival, with their times of arrival.
+        """Returns a queue whose messages are decoded and time-stamped on arrival.
 
-        The time of arrival is read in the network thread that receives the message. It is
-        therefore correct even if the owner of the queue reads the message much later.
+        The time of arrival is taken in the network thread that receives the message, so it is
+        correct even if the queue is read much later.
 
         Args:
             key: The key, which may contain wildcards.
             now_ns: Function that reads the local clock, in ns.
-            read: Function that decodes a payload, in a network thread. It must not raise an
-                error. `bytes` leaves the payload as it is.
-            capacity: Number of messages that the queue holds. If it is full, the oldest message
-                is dropped.
+            read: Function that decodes a payload in a network thread. It must not raise an
+                error. Pass `bytes` to leave the payload unchanged.
+            capacity: Number of messages that the queue can hold. If it is full, the oldest
+                message is dropped.
         """
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
@@ -128,46 +127,44 @@ class Bus(Protocol):
 
         Args:
             key: The key, which may contain wildcards.
-            callback: Function that receives the key and the payload of each message. It is
-                called in a network thread, and must be fast.
+            callback: Function that receives the key and payload of each message. It is called
+                in a network thread and must return quickly.
         """
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """Returns a queue of the requests that other processes send under a key.
+        """Returns a queue of the queries that other processes send under a key.
 
-        The caller removes the queries from the queue, and replies to them when it has time. In
-        contrast, `respond` replies at once.
+        The caller polls the queue and replies when it has time. Use `respond` to reply
+        immediately.
 
         Args:
             key: The key, which may contain wildcards.
         """
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Replies to requests under a key at once, in a network thread.
-
-        The calculation of the reply must therefore be short.
+        """Answers queries under a key immediately, in a network thread.
 
         Args:
             key: The key, which may contain wildcards.
-            answer: Function that receives the payload of a query, and returns the payload of
-                the reply. It returns None to send no reply. It must be fast, because messages
-                wait meanwhile, and must not raise an error.
+            answer: Function that receives the payload of a query and returns the payload of the
+                reply, or None to send no reply. It must return quickly, since it blocks
+                incoming messages, and must not raise an error.
         """
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Sends a request to all processes that serve a matching key, and collects the replies.
+        """Sends a query to all processes that serve a matching key, and collects the replies.
 
         Args:
             key: The key, which may contain wildcards.
             payload: Payload of the query.
 
         Returns:
-            A queue into which the replies are put as they arrive. It stays empty if no member
+            A queue that receives the replies as they arrive. It stays empty if no member
             replies.
         """
 
     def announce(self, key: str) -> None:
-        """Shows other processes that this one is present, by a liveliness token of Zenoh.
+        """Announces this process to the others by declaring a Zenoh liveliness token.
 
         The token disappears when the connection is closed or lost.
 
@@ -176,20 +173,20 @@ class Bus(Protocol):
         """
 
     def presence(self, key: str) -> PresenceInbox:
-        """Returns a queue that tells which other members have appeared or disappeared.
+        """Returns a queue that reports which other members have appeared or disappeared.
 
         Each member is represented by a liveliness token, see `announce`. An entry of the queue
-        is the key of a token, and True if the token has appeared, or False if it has
-        disappeared. The first entries are the tokens that exist already.
+        consists of the key of a token and a flag, which is True if the token has appeared and
+        False if it has disappeared. Tokens that already exist are reported first.
 
         Args:
             key: Key of the tokens, which may contain wildcards.
         """
 
     def close(self) -> None:
-        """Closes the network connection, so that other processes see that this one is gone.
+        """Closes the network connection. Other processes then see that this one has left.
 
-        Calling it again has no effect.
+        Repeated calls have no effect.
         """
 
 
@@ -197,8 +194,8 @@ class Bus(Protocol):
 def _compile_expression(expression: str) -> re.Pattern[str]:
     """Converts a key with wildcards to a regular expression, see `matches_key`.
 
-    The regular expression matches keys with a leading slash, so that every part of a key has
-    the same form: a slash and some characters.
+    The regular expression matches keys with a leading slash, which gives every part of a key
+    the same form: a slash followed by characters.
     """
     one_part = "/[^/]+"
     pattern = ""
@@ -214,10 +211,10 @@ def _compile_expression(expression: str) -> re.Pattern[str]:
 
 
 def matches_key(expression: str, key: str) -> bool:
-    """Returns True if a key with wildcards matches a key, by the rules of Zenoh.
+    """Returns True if a key matches an expression with wildcards, by the rules of Zenoh.
 
-    Keys consist of parts between slashes. The wildcard `*` stands for one part, `**` for any
-    number of parts, and `$*` for any characters within a part.
+    Keys consist of parts separated by slashes. The wildcard `*` matches one part, `**` any
+    number of parts, and `$*` any characters within a part.
 
     Args:
         expression: Key with wildcards.
@@ -227,43 +224,39 @@ def matches_key(expression: str, key: str) -> bool:
 
 
 class BoundedRing(Generic[T]):
-    """A queue of limited length between two threads, which drops its oldest entry if full.
+    """A bounded queue between two threads that drops its oldest entry when full.
 
-    A control loop, for example, needs the newest messages rather than all. One thread may call
-    `put` while another thread calls `poll`.
+    Suited to control loops, which need the newest messages rather than all of them. One thread
+    may call `put` while another calls `poll`.
 
     Args:
-        capacity: Number of entries that the queue holds.
+        capacity: Number of entries that the queue can hold.
     """
 
     def __init__(self, capacity: int = RING_CAPACITY) -> None:
         self._entries: deque[T] = deque(maxlen=capacity)
 
     def put(self, entry: T) -> None:
-        """Adds an entry to the queue without waiting. A full queue drops its oldest entry."""
+        """Appends an entry without waiting, dropping the oldest one if the queue is full."""
         self._entries.append(entry)
 
     def poll(self) -> T | None:
-        """Removes the oldest entry from the queue and returns it, without waiting.
+        """Removes and returns the oldest entry, or returns None if the queue is empty.
 
-        Returns:
-            The entry. None if the queue is empty.
+        Never waits.
         """
         return self._entries.popleft() if self._entries else None
 
 
 class StampingRing(BoundedRing[tuple[T, int]]):
-    """A queue of messages that are decoded on arrival, with their times of arrival.
+    """A bounded queue of messages that are decoded and time-stamped on arrival.
 
-    One thread may call `receive` while another thread calls `poll`.
-
-    The time is read before a message is decoded, so that the time of decoding does not count as
-    a delay of the network.
+    One thread may call `receive` while another calls `poll`.
 
     Args:
         now_ns: Function that reads the local clock, in ns.
         read: Function that decodes a payload. It must not raise an error.
-        capacity: Number of messages that the queue holds.
+        capacity: Number of messages that the queue can hold.
     """
 
     def __init__(
@@ -274,10 +267,10 @@ class StampingRing(BoundedRing[tuple[T, int]]):
         self._read = read
 
     def receive(self, payload: bytes) -> None:
-        """Decodes a message, and adds it to the queue with its time of arrival.
+        """Decodes a message and appends it to the queue with its time of arrival.
 
-        The clock is read before the message is decoded. If the queue is full, the oldest
-        message is dropped.
+        The clock is read before decoding, so that the decoding time is not counted as network
+        delay. If the queue is full, the oldest message is dropped.
 
         Args:
             payload: The encoded message.

@@ -1,8 +1,8 @@
 """Provides the clocks that all other modules use to read the time and to sleep.
 
-Code that needs the time receives a `Clock` as an argument, so that tests and simulations can
-use a clock of their own, for example one that drifts (law L1 of docs/develop/design.md). Times
-are integers in ns, because floating-point numbers would lose precision after a few months.
+Code that needs the time takes a `Clock` as an argument, which lets tests and simulations supply
+their own clock, such as one that drifts (law L1 of docs/develop/design.md). Times are integers
+in ns; floating-point seconds would lose precision after a few months.
 
 Invariant:
     - No other module reads a clock of the operating system.
@@ -17,46 +17,46 @@ from ..records import NS_PER_S
 
 
 class Clock(Protocol):
-    """Interface of the clocks that this program uses.
+    """Interface of the clocks used by this program.
 
-    A clock reads a monotonic time, which never steps, and the time of day, which may step.
-    Control loops are timed by the monotonic time. Tests replace the clock of the machine by
-    clocks of their own.
+    A clock provides a monotonic time, which never steps and is used for timing control loops,
+    and the time of day, which may step. Tests replace the system clock with clocks of their
+    own.
     """
 
     def monotonic_ns(self) -> int:
-        """Returns the reading of a clock that never steps, in ns, to measure durations.
+        """Returns a monotonic time in ns, for measuring durations.
 
-        The zero of this clock is arbitrary, so only differences between readings have a
-        meaning.
+        The zero point is arbitrary, so only differences between readings are meaningful.
         """
 
     def unix_ns(self) -> int:
-        """Returns the time of day of the machine, as the time since 1970 in ns.
+        """Returns the time of day of the machine, in ns since 1970.
 
-        It may step at any moment, for example when the machine synchronises its clock with
-        others. Durations are therefore computed from `monotonic_ns`.
+        The value may step at any moment, for example when the machine synchronises its clock.
+        Use `monotonic_ns` to measure durations.
         """
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock has reached a time, such as the next control period.
+        """Sleeps until the monotonic clock reaches a given time, such as the next tick.
 
         Args:
-            deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
-                method returns at once.
+            deadline_ns: Time on the monotonic clock, in ns. If it has already passed, the
+                method returns immediately.
         """
 
     def identity(self) -> str:
         """Returns a string that is equal in two processes if they share a monotonic clock.
 
-        This is the case on one machine. Only then can readings of both processes be compared.
+        Processes on one machine normally share it. Only then can their readings be compared
+        directly.
         """
 
 
 class SystemClock:
     """The monotonic clock and the time of day of the operating system.
 
-    Live processes use this class. Tests replace it by other clocks.
+    This is the clock of live processes; tests substitute other clocks.
     """
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
@@ -64,11 +64,11 @@ class SystemClock:
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock has reached a time, such as the next control period.
+        """Sleeps until the monotonic clock reaches a given time, such as the next tick.
 
         Args:
-            deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
-                method returns at once.
+            deadline_ns: Time on the monotonic clock, in ns. If it has already passed, the
+                method returns immediately.
         """
         remaining_ns = deadline_ns - self.monotonic_ns()
         if remaining_ns > 0:
@@ -78,8 +78,8 @@ class SystemClock:
     def identity(self) -> str:
         """Returns a string that identifies the monotonic clock of this machine.
 
-        On Linux it consists of the kernel's boot identifier and the time namespace, because
-        containers may have a clock of their own. On other systems it contains the name of the
+        On Linux, the string combines the kernel's boot identifier with the time namespace,
+        since a container may have its own clock. On other systems it contains the name of the
         machine.
         """
         try:
@@ -91,11 +91,11 @@ class SystemClock:
 
     @classmethod
     def with_error(cls, offset_s: float, drift_ppm: float) -> Clock:
-        """Returns the clock of this machine, or for tests a clock with an offset and a drift.
+        """Returns the system clock, or one with an offset and a drift from it for tests.
 
         Args:
-            offset_s: Offset relative to the machine's clock, in s.
-            drift_ppm: Drift relative to the machine's clock, in parts per million.
+            offset_s: Offset from the system clock, in s.
+            drift_ppm: Drift relative to the system clock, in parts per million.
         """
         if not offset_s and not drift_ppm:
             return cls()
@@ -105,18 +105,18 @@ class SystemClock:
 class SkewedClock:
     """A clock with an offset and a drift relative to a base clock, for tests on one machine.
 
-    The clock behaves like the clock of another machine. It reads
+    It simulates the clock of another machine and reads
 
         start + offset + (reading - start) (1 + drift),
 
-    where `reading` is the present reading of the base clock, and `start` was its reading when
-    this object was created. The time of day is not changed. The identity of the clock is
-    unique. It states the offset, the drift and the start, so that readers of a log can convert
-    the readings.
+    where `reading` is the current reading of the base clock, and `start` is its reading when
+    this object was created. The time of day is not changed. The identity of the clock is unique
+    and contains the offset, the drift and the start, which allows readers of a log to convert
+    the times.
 
     Args:
         clock: The base clock.
-        offset_ns: Offset relative to the base clock, in ns.
+        offset_ns: Offset from the base clock, in ns.
         drift_ppb: Drift relative to the base clock, in ns/s.
     """
 
@@ -127,7 +127,7 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """Returns the time of a deliberately wrong clock, in ns, to test synchronisation.
+        """Returns the time of this deliberately inaccurate clock, in ns.
 
         true time + offset + drift * (time since the clock was created)
         """
@@ -136,29 +136,29 @@ class SkewedClock:
         return self._start_ns + self._offset_ns + passed_ns + drift_ns
 
     def unix_ns(self) -> int:
-        """Returns the correct time of day in ns since 1970, without offset and drift.
+        """Returns the true time of day in ns since 1970, with no offset or drift.
 
-        Only the monotonic time of this class is deliberately wrong.
+        This class simulates clock errors only in its monotonic time.
         """
         return self._clock.unix_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until this clock has reached a time.
+        """Sleeps until this clock reaches a given time.
 
-        The deadline is converted to a time of the base clock, which then sleeps. When the base
-        clock has advanced by p since the start, this clock reads
+        The deadline is converted to a time of the base clock, which then does the sleeping.
+        When the base clock has advanced by p since the start, this clock reads
 
             start + offset + p (1 + drift).
 
-        Solving this for p gives the time for which the base clock must run:
+        Solving for p gives the time for which the base clock must run:
 
             p = (deadline - start - offset) / (1 + drift).
 
-        The drift is stored in ns/s, so that 1 + drift is (NS_PER_S + drift_ppb) / NS_PER_S.
+        The drift is stored in ns/s, so 1 + drift is (NS_PER_S + drift_ppb) / NS_PER_S.
 
         Args:
-            deadline_ns: The time on this clock, in ns. If it has passed already, the method
-                returns at once.
+            deadline_ns: Time on this clock, in ns. If it has already passed, the method returns
+                immediately.
         """
         # Time from the start to the deadline, as this clock and as the base clock measure it.
         skewed_duration_ns = deadline_ns - self._start_ns - self._offset_ns
@@ -168,10 +168,9 @@ class SkewedClock:
         self._clock.sleep_until(self._start_ns + base_duration_ns)
 
     def identity(self) -> str:
-        """Returns a string that identifies this wrong clock by its offset, drift and start.
+        """Returns a string that identifies this clock by its offset, drift and start.
 
-        From these numbers, a reader of a log can convert its readings to those of the correct
-        clock.
+        Readers of a log use these values to convert the clock's readings to true times.
         """
         return (
             f"{self._clock.identity()}, skewed by {self._offset_ns} ns "

@@ -1,20 +1,19 @@
 """Decides how a process connects to the network of a session.
 
-Two processes of a session on one machine find each other without any option. The process of
-each arm (the site) has a default port, which follows from the name of the session and the index
-of the site. On several machines, the user names the endpoints, for example tcp/host:10241. A
-`Connection` consists of the endpoints at which a process listens and to which it connects, its
-mode, and optionally the keys that prove its identity. `Connection.of_member` derives it from
-the command line and a user's Zenoh file.
+Two processes of a session on one machine find each other without any options, because each site
+has a default port derived from the name of the session and the index of the site. If the
+session spans several machines, the user names the endpoints, for example tcp/host:10241. A
+`Connection` holds the endpoints on which a process listens and to which it connects, its mode
+and, optionally, the keys that prove its identity. `Connection.of_member` builds one from the
+command line and the user's Zenoh file.
 
 Invariant:
-    - Default endpoints are addresses of this machine only (127.0.0.1). Nobody else can connect
-      unless the user names an endpoint.
-    - Two sessions with different names get different default ports in most cases, because the
-      port is selected by a checksum of the name.
-    - An endpoint that the user names replaces the default. If the command line and the file
-      name different ones, they are united or refused, but the program never silently prefers
-      one of them.
+    - Default endpoints are only reachable from this machine (127.0.0.1). Other machines cannot
+      connect unless the user names an endpoint.
+    - Sessions with different names usually get different default ports, because the port is
+      derived from a checksum of the name.
+    - An endpoint named by the user replaces the default. If the command line and the file name
+      different endpoints, they are either combined or rejected; neither is silently preferred.
 """
 
 import ipaddress
@@ -40,18 +39,17 @@ if TYPE_CHECKING:
 _FIRST_PORT = 10_240
 """Lowest default port. The default ports are divided into blocks, one block per session."""
 _BLOCKS = 340
-"""Number of blocks. The CRC-32 of the session's name selects one."""
+"""Number of blocks. The block of a session is selected by the CRC-32 of its name."""
 _BLOCK = 64
 """Number of ports in a block."""
 
 
 @dataclass(frozen=True, slots=True)
 class DefaultEndpoints:
-    """The network addresses at which the sites of a session (arm controllers) listen.
+    """Network addresses on which the sites of a session listen unless the user names others.
 
-    These endpoints apply if the user names none. The ports are computed from the name of the
-    session and the index of the site, so that every process finds the endpoints without any
-    configuration.
+    The ports are computed from the name of the session and the index of the site, so every
+    process can find the endpoints without configuration.
 
     Attributes:
         session: Name of the session.
@@ -60,13 +58,10 @@ class DefaultEndpoints:
     session: str
 
     def of_site(self, index: int) -> str:
-        """Returns the endpoint of one site.
+        """Returns the endpoint of one site on this machine, such as "tcp/127.0.0.1:10241".
 
         Args:
-            index: Index of the site in the scenario, from 0.
-
-        Returns:
-            The endpoint on this machine, as in "tcp/127.0.0.1:10241".
+            index: Index of the site in the scenario, starting from 0.
         """
         # A checksum of the name selects one of `_BLOCKS` blocks of consecutive ports, so that
         # two sessions on one machine rarely get the same ports.
@@ -75,11 +70,11 @@ class DefaultEndpoints:
         return f"tcp/127.0.0.1:{port}"
 
     def by_site(self, sites: Sequence[str], *, encrypted: bool = False) -> dict[str, str]:
-        """Returns the endpoint of each site, by the name of the site.
+        """Returns a mapping from the name of each site to its endpoint.
 
         Args:
-            sites: Names of the sites, in the order of the scenario.
-            encrypted: True for endpoints of TLS instead of TCP.
+            sites: Names of the sites, in scenario order.
+            encrypted: True for TLS endpoints instead of TCP.
         """
         endpoints = {}
         for index, site in enumerate(sites):
@@ -91,20 +86,20 @@ class DefaultEndpoints:
     def reserve(self, site_count: int) -> Iterator[list[str]]:
         """Reserves a network endpoint for each site of the session, as a context manager.
 
-        The default endpoints are used if they are free, and otherwise any free ports. Inside
-        the `with` block, other callers of this method get other endpoints, so that two sessions
-        of the same name can run at the same time.
+        The default endpoints are used if they are free; otherwise any free ports are used.
+        Inside the `with` block, other callers of this method get different endpoints, so two
+        sessions with the same name can run at the same time.
 
         Args:
             site_count: Number of sites.
 
         Yields:
-            The endpoints, in the order of the sites.
+            One endpoint per site, in scenario order.
         """
         default = [self.of_site(index) for index in range(site_count)]
         ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
         # The last port of the block shows that the block is reserved. The ports themselves
-        # cannot show it, because they are shared with the sites that will listen at them.
+        # cannot show it, because they are shared with the sites that will listen on them.
         first_port_of_block = ports[0] - ports[0] % _BLOCK
         last_port_of_block = first_port_of_block + _BLOCK - 1
         with ExitStack() as stack:
@@ -117,7 +112,7 @@ class DefaultEndpoints:
 
 
 def find_free_endpoints(count: int) -> list[str]:
-    """Returns network addresses on this machine whose ports no program uses at this moment.
+    """Returns endpoints on this machine whose ports are currently unused.
 
     Another program may take a port before the caller does.
 
@@ -129,19 +124,19 @@ def find_free_endpoints(count: int) -> list[str]:
 
 
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Reserves ports of this machine for sites (arm controllers) that will listen at them.
+    """Reserves ports of this machine for sites that will listen on them.
 
-    A port is reserved by a socket that is bound to it but does not listen. The operating system
-    then assigns the port to no program that asks for any free port.
+    A port is reserved by binding a socket to it without listening. The operating system then
+    does not assign the port to programs that ask for any free port.
 
     Args:
-        stack: Closes the sockets, and thereby ends the reservation.
+        stack: Closes the sockets, which ends the reservation.
         ports: Numbers of the ports. 0 stands for any free port.
-        shared: True if the site can listen at its port while the port is still reserved. False
+        shared: True if the site can listen on its port while the port is still reserved. False
             to reserve the port exclusively.
 
     Returns:
-        The endpoints of the reserved ports, in the order of the ports.
+        The endpoints of the reserved ports, in the same order.
 
     Raises:
         OSError: A port is in use.
@@ -156,27 +151,28 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
 
 
 ENDS_SOON = timedelta(days=7)
-"""The user is warned if the validity of the keys ends within this time."""
+"""The user is warned if the keys expire within this time."""
 _DATE = "%Y-%m-%d %H:%M:%S UTC"
-"""Format of the end of validity in messages to the user."""
+"""Format of the expiry date in messages to the user."""
 RETRY_NS = 200_000_000
 """Time between two attempts to reach a router, in ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """How a process connects to the network of a session: endpoints, mode and keys.
+    """Describes how a process connects to the network of a session: endpoints, mode and keys.
 
     Attributes:
-        listen: Endpoints at which the process listens.
+        listen: Endpoints on which the process listens.
         connect: Endpoints to which the process connects. A client uses the first one that
             answers. None if the endpoints are not known yet and have to be found.
         mode: "peer" connects directly to the other members, "client" connects to a router, and
-            "router" is a router itself.
-        settings: Zenoh settings from a user's file or from keys.
-        keys_of: Name of the member whose keys are used. Empty if there are no keys. With keys,
-            all messages are encrypted, and both ends prove their identities by certificates.
-        keys_end: Time at which the keys expire, in UTC. None if there are no keys.
+            "router" acts as a router.
+        settings: Zenoh settings from the user's file or from keys.
+        keys_of: Name of the member whose keys are used, or empty if there are no keys. With
+            keys, all messages are encrypted, and both ends prove their identities with
+            certificates.
+        keys_end: Expiry time of the keys, in UTC. None if there are no keys.
     """
 
     listen: Sequence[Endpoint] = ()
@@ -187,14 +183,13 @@ class Connection:
     keys_end: datetime | None = None
 
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
-        """Converts endpoints to encrypted endpoints, if this process has keys.
+        """Converts endpoints to encrypted endpoints if this process has keys.
 
-        An endpoint is an address such as "tcp/127.0.0.1:10241". With keys, all connections are
-        encrypted: TLS replaces TCP. Without keys, the endpoints are returned unchanged.
+        With keys, TLS replaces TCP. Without keys, the endpoints are returned unchanged.
 
         Args:
-            endpoints: Endpoints as text, or groups of endpoints from a user's Zenoh file. The
-                groups are returned unchanged.
+            endpoints: Endpoints as strings, such as "tcp/127.0.0.1:10241", or groups of
+                endpoints from a user's Zenoh file. Groups are returned unchanged.
         """
         if not self.keys_of:
             return list(endpoints)
@@ -208,30 +203,30 @@ class Connection:
 
     @property
     def listen_addresses(self) -> list[str]:
-        """Addresses at which the process listens, as text, encrypted if there are keys."""
+        """Addresses on which the process listens, as strings. Encrypted if there are keys."""
         return find_endpoint_addresses(self.reach(self.listen))
 
     @property
     def connect_addresses(self) -> list[str]:
-        """Addresses to which the process connects, as text, encrypted if there are keys.
+        """Addresses to which the process connects, as strings. Encrypted if there are keys.
 
-        The list is empty if the endpoints are not known yet.
+        Empty if the endpoints are not known yet.
         """
         return find_endpoint_addresses(self.reach(self.connect or ()))
 
     def open(self) -> ZenohBus:
-        """Opens the network connection of this process, as the attributes describe it.
+        """Opens the network connection of this process, as described by the attributes.
 
         If the process has keys, the endpoints are replaced by encrypted ones (`reach`). The
         mode determines whether the process connects to the other members, connects to a router,
-        or is a router itself.
+        or acts as a router.
 
         Returns:
-            The bus, through which messages are sent and received.
+            The bus that sends and receives messages.
 
         Raises:
-            UnknownHost: A host name cannot be resolved. This is checked first, because Zenoh
-                would try to resolve the name forever.
+            UnknownHost: A host name cannot be resolved. This is checked first, since Zenoh
+                would retry an unknown name forever.
             RouterSilent: This process is a client, and no router answers.
             UsageError: Zenoh cannot use an endpoint.
         """
@@ -242,17 +237,17 @@ class Connection:
         return ZenohBus(listen_endpoints, connect_endpoints, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
-        """Checks that the keys of the member stay valid until the planned end of a session.
+        """Raises UsageError if the member's keys expire before the planned end of a session.
 
-        An open connection continues after its certificate has expired, but no new connection
-        can be opened. After a short interruption of the network, a member (process of a
-        session) could not return.
+        A connection that is already open survives the expiry of its certificate, but new
+        connections are impossible. After a short interruption of the network, a member could
+        therefore not reconnect.
 
         Args:
             left_s: Remaining duration of the session, in s.
 
         Raises:
-            UsageError: The keys end before the session.
+            UsageError: The keys expire before the end of the session.
         """
         if self.keys_end is None:
             return
@@ -267,11 +262,9 @@ class Connection:
     def describe_end(self) -> str:
         """Returns a warning for the user if the keys of this process will expire soon.
 
-        The keys encrypt its connections, and prove its identity.
-
         Returns:
-            The warning. Empty if the keys stay valid for longer than `ENDS_SOON`, or if the
-            process has no keys.
+            The warning, or an empty string if the process has no keys or the keys remain valid
+            for longer than `ENDS_SOON`.
         """
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
@@ -279,19 +272,19 @@ class Connection:
         return f"the keys of {self.keys_of} expire on {self.keys_end:{_DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":
-        """Checks that this connection has no keys, or the keys of the named member.
+        """Raises UsageError if this connection uses the keys of a different member.
 
-        Other members would refuse a process that takes part under one name, but proves its
-        identity with the keys of another name.
+        The other members would reject a process that joins under one name but proves its
+        identity with the keys of another.
 
         Args:
             member: Name under which this process will take part in the session.
 
         Returns:
-            This connection, unchanged, so that the check can be part of an expression.
+            This connection, which allows the check to be part of an expression.
 
         Raises:
-            UsageError: The connection has the keys of another member.
+            UsageError: The connection uses the keys of a different member.
         """
         if self.keys_of not in ("", member):
             raise UsageError(
@@ -311,24 +304,24 @@ class Connection:
         *,
         routes: bool = False,
     ) -> "Connection":
-        """Derives the connection of a process from the command line and a user's Zenoh file.
+        """Builds the connection of a process from the command line and the user's Zenoh file.
 
-        If there is a router (named by `--router`, or if the file has the mode "client"), the
-        process connects only to the router, and does not listen.
+        If there is a router (named with `--router`, or implied by the mode "client" in the
+        file), the process connects only to the router and does not listen.
 
         Args:
-            listen: Endpoints of the option --listen. None if the option is absent.
-            connect: Endpoints of the option --connect. None if the option is absent.
-            routers: Endpoints of the option --router. None if the option is absent.
-            file: The user's Zenoh file, or its path. None if there is none.
-            listen_else: Endpoints at which to listen if neither an option nor the file names
+            listen: Endpoints given with --listen. None if the option is absent.
+            connect: Endpoints given with --connect. None if the option is absent.
+            routers: Endpoints given with --router. None if the option is absent.
+            file: The user's Zenoh file or its path. None if there is no file.
+            listen_else: Endpoints on which to listen if neither an option nor the file names
                 any.
             connect_else: Endpoints to which to connect if neither an option nor the file names
                 any.
-            routes: True if the process is a router itself.
+            routes: True if the process itself is a router.
 
         Returns:
-            The connection: endpoints and mode, without keys.
+            The connection, with endpoints and mode but no keys.
 
         Raises:
             UsageError: The file cannot be used, or the options and the file contradict each
@@ -377,7 +370,7 @@ class Connection:
         if listen is not None or file.endpoints("listen", "client"):
             raise UsageError(
                 f"{client_source}: a client of a router does not listen on any endpoint; "
-                "leave out the endpoints to listen at"
+                "leave out the endpoints to listen on"
             )
         if routers and connect is not None:
             raise UsageError(
@@ -405,12 +398,11 @@ class Connection:
         """Adds a member's keys to a connection, or checks that it is safe without keys.
 
         Args:
-            keys: Keys of a member (process of a session), or the folder that contains them.
-                None if there are no keys.
-            insecure: True to permit endpoints that other machines can reach without keys.
+            keys: Keys of a member, or the folder that contains them. None if there are no keys.
+            insecure: True to allow endpoints that other machines can reach without keys.
 
         Returns:
-            The connection, with the keys.
+            The connection with the keys.
 
         Raises:
             UsageError: The keys cannot be used or contradict the user's settings, an endpoint
@@ -451,21 +443,21 @@ class Connection:
         timeout_s: float | None,
         say: Callable[[str], None],
     ) -> ZenohBus | None:
-        """Opens a connection, and waits until a router answers if there is one.
+        """Opens a connection and, if there is a router, waits until it answers.
 
         Args:
             clock: Clock of the caller.
-            stopped: Function that returns True to give up.
+            stopped: Function that returns True to cancel the wait.
             timeout_s: Longest wait for a router, in s. If None, there is no limit.
             say: Function that prints a line for the user.
 
         Returns:
-            The bus. None if `stopped` returned True before a router answered.
+            The bus, or None if `stopped` returned True before a router answered.
 
         Raises:
             UsageError: An endpoint cannot be used.
-            UnknownHost: A host name cannot be resolved at the first attempt. In later attempts
-                this is ignored, because the name service may be unavailable for some time.
+            UnknownHost: A host name cannot be resolved at the first attempt. Later failures are
+                ignored, since the name service may be temporarily unavailable.
             SessionError: No router answered in time.
         """
         begun_ns = clock.monotonic_ns()
@@ -487,13 +479,13 @@ class Connection:
 
 
 def _check_encrypted_endpoint(address: str) -> None:
-    """Refuses an endpoint that is not encrypted, or that states its own encryption settings.
+    """Raises UsageError if an endpoint is unencrypted, or sets its own encryption settings.
 
-    The settings of the encryption come from the keys. Settings of the network interface
-    (`iface`, `bind`, `dscp`, `so_...`) are permitted.
+    The encryption settings must come from the keys. Settings of the network interface (`iface`,
+    `bind`, `dscp`, `so_...`) are allowed.
 
     Raises:
-        UsageError: The endpoint is refused.
+        UsageError: The endpoint is rejected.
     """
     if not address.startswith(ENCRYPTED):
         raise UsageError(
@@ -508,10 +500,10 @@ def _check_encrypted_endpoint(address: str) -> None:
 
 
 def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
-    """Refuses a user's Zenoh settings that would contradict the encryption keys of a session.
+    """Raises UsageError if the user's Zenoh settings contradict a session's encryption keys.
 
     Args:
-        settings: Settings of the file.
+        settings: Settings from the file.
 
     Raises:
         UsageError: The file contains such a setting.
@@ -530,16 +522,16 @@ def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
 
 
 def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
-    """Refuses to listen without keys at an endpoint that other machines can reach.
+    """Raises UsageError if a process without keys listens for other machines.
 
-    It is permitted if the user's own Zenoh settings require certificates of both ends.
+    This is allowed if the user's own Zenoh settings require certificates at both ends.
 
     Args:
         connection: The connection.
-        insecure: True to permit such endpoints.
+        insecure: True to allow such endpoints.
 
     Raises:
-        UsageError: An endpoint is refused.
+        UsageError: An endpoint is rejected.
     """
     link_settings = connection.settings.get("transport", {}).get("link", {})
     has_mutual_tls = link_settings.get("tls", {}).get("enable_mtls") is True
@@ -555,16 +547,16 @@ def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
 
 
 ENCRYPTED = ("tls/", "quic/")
-"""Beginnings of the endpoints whose transport is encrypted."""
+"""Prefixes of the endpoints whose transport is encrypted."""
 
 
 def is_loopback(address: str) -> bool:
-    """Returns True if an address can be reached from this machine only.
+    """Returns True if an address can only be reached from this machine.
 
-    Such addresses need no encryption, because no other machine can connect to them.
+    Such addresses need no encryption, because other machines cannot connect to them.
 
     Args:
-        address: Address of an endpoint, as in "tcp/127.0.0.1:7447".
+        address: Address of an endpoint, such as "tcp/127.0.0.1:7447".
     """
     protocol, _, address_part = address.partition("/")
     host_and_port = re.split(r"[?#]", address_part)[0]  # without Zenoh's settings
@@ -585,12 +577,12 @@ def _join_options(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    """Derives the network connection of a process from its options and its Zenoh file.
+    """Builds the network connection of a process from its options and the user's Zenoh file.
 
     `listen_else` and `connect_else` are the defaults, see `Connection.of_member`.
 
     Raises:
-        UsageError: Both the command line and the file name endpoints at which to listen.
+        UsageError: Both the command line and the file name endpoints on which to listen.
     """
     file_listen = file.endpoints("listen", mode)
     if listen is not None and file_listen is not None:
@@ -614,12 +606,13 @@ def _merge_endpoints(
     mode: ZenohMode,
     fallback_endpoints: Sequence[str] | None,
 ) -> Sequence[Endpoint] | None:
-    """Returns the endpoints to which a process connects, from the command line and a file.
+    """Returns the endpoints to which a process connects, from the command line and the file.
 
-    The endpoints of the command line come first, then further ones of the user's Zenoh file.
+    Endpoints from the command line come first, followed by additional ones from the user's
+    Zenoh file.
 
     Args:
-        named_endpoints: Endpoints of the option. None if the option is absent.
+        named_endpoints: Endpoints given with the option. None if the option is absent.
         file: The user's Zenoh file.
         mode: Mode of the process.
         fallback_endpoints: Endpoints to use if neither the option nor the file names any.

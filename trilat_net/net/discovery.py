@@ -1,7 +1,7 @@
-"""Finds a running session from outside, and connects to it.
+"""Finds a running session from outside and connects to it.
 
-This module serves programs that are not part of a session: the recorder before it joins, and
-the commands that stop arms, change network delays or measure the network.
+Used by programs that are not (yet) part of a session: the recorder before it joins, and the
+commands that stop arms, change network delays or measure the network.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,7 +18,7 @@ from .membership import liveliness_token
 from .session_members import SessionMembers
 
 SiteNamesOf = Callable[[str], tuple[str, ...]]
-"""Function that returns the names of the sites in the text of a scenario, in their order.
+"""Function that returns the names of the sites from the text of a scenario, in scenario order.
 
 It raises `ScenarioError` if the text is not a scenario.
 """
@@ -38,10 +38,11 @@ def connect_to_session(
 ) -> Iterator[Bus | None]:
     """Connects to the sites of a session, as a context manager that closes the connection.
 
-    If the endpoints are not known (`connection.connect` is None), they are found in two ways.
-    If files on this machine show that all sites of the session run here, their endpoints are
-    used. Otherwise the first site of the session, at its default endpoint on this machine, is
-    queried for the names of the other sites, whose default endpoints follow from the names.
+    If the endpoints are not known (`connection.connect` is None), they are found in one of two
+    ways. If files on this machine show that all sites of the session run here, their endpoints
+    are used. Otherwise, the first site of the session is queried at its default endpoint on
+    this machine. It returns the names of the other sites, which determine their default
+    endpoints.
 
     Args:
         connection: Endpoints and mode of the caller.
@@ -49,19 +50,19 @@ def connect_to_session(
         session: Name of the session.
         names: Function that returns the names of the sites in a scenario. If it returns no
             names, only the first site is connected.
-        stopped: Function that returns True to give up.
+        stopped: Function that returns True to cancel the search.
         timeout_s: Longest wait for the first site or for a router, in s. If None, there is no
             limit.
         say: Function that prints a line for the user.
-        recorder_boot: Random number that identifies this start of the caller, if the caller is
-            a recorder. The recorder is announced during the search, so that the session waits
-            for it. None for other callers.
+        recorder_boot: Boot of the caller (the random number that identifies this start of its
+            process) if the caller is a recorder. The recorder is then announced during the
+            search, so that the session waits for it. None for other callers.
 
     Yields:
-        The network connection. None if `stopped` returned True.
+        The network connection, or None if `stopped` returned True.
 
     Raises:
-        SessionError: No site, or no router, replies in time.
+        SessionError: No site or router replies in time.
         UsageError: An endpoint cannot be used.
     """
     with ExitStack() as stack:
@@ -69,7 +70,7 @@ def connect_to_session(
         def connect(target: Connection) -> Bus | None:
             """Opens a network connection, which is closed at the end of the `with` block.
 
-            The yielded connection is None if `stopped` has returned True.
+            Returns None if `stopped` has returned True.
             """
             bus = target.open_bus(clock=clock, stopped=stopped, timeout_s=timeout_s, say=say)
             return None if bus is None else stack.enter_context(closing(bus))
@@ -112,21 +113,20 @@ def _query_sites(
 ) -> tuple[str, ...] | None:
     """Queries the members of a session for the names of its sites.
 
-    A site is a process that runs one arm. Its reply contains the scenario, the description of
-    the experiment, which names all sites of the session.
+    A site replies with its scenario, which names all sites of the session.
 
     Args:
-        bus: Network connection that reaches the first site.
+        bus: Network connection through which the first site can be reached.
         clock: Clock of the caller.
         session: Name of the session.
-        parse_site_names: Function that returns the names of the sites in the text of a
+        parse_site_names: Function that returns the names of the sites from the text of a
             scenario. It raises `ScenarioError` if the text is not a scenario.
-        stopped: Function that returns True to give up.
+        stopped: Function that returns True to cancel the search.
         timeout_s: Longest wait for a reply, in s. If None, the wait lasts until `stopped`
             returns True.
 
     Returns:
-        The names, from the first reply that contains a scenario. None if `stopped` returned
+        The names, from the first reply that contains a scenario, or None if `stopped` returned
         True.
 
     Raises:

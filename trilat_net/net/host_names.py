@@ -1,9 +1,9 @@
-"""Refuses misspelt host names before a network connection is opened.
+"""Rejects misspelt host names before a network connection is opened.
 
-Zenoh, the library that transports the messages, would try to connect to a misspelt host
-forever, without an error. `check_hosts` therefore asks the name service for the host name of
-each endpoint, a network address such as tcp/host:10241, and opens no connection. Endpoints
-without a host name, such as numeric addresses and socket files, need no check.
+Zenoh, the library that transports the messages, keeps trying to reach a misspelt host forever
+without reporting an error. `check_hosts` therefore resolves the host name of each endpoint (a
+network address such as tcp/host:10241) without opening a connection. Endpoints that contain no
+host name, such as numeric addresses and socket files, are not checked.
 """
 
 import ipaddress
@@ -15,24 +15,24 @@ from ..errors import UsageError
 from .zenoh_config import Endpoint
 
 _ENDPOINT = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
-"""Pattern of a Zenoh endpoint or a web address with a host and a port."""
+"""Pattern that matches a Zenoh endpoint or a web address with a host and a port."""
 
 
 class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
     """Error: the host name of a network address cannot be resolved.
 
-    The name may be misspelt, or the name service may be out of reach.
+    The name may be misspelt, or the name service may be unreachable.
     """
 
 
 def find_endpoint_addresses(endpoints: Iterable[Endpoint]) -> list[str]:
-    """Returns the addresses of endpoints as text, including those of grouped endpoints.
+    """Returns the addresses of endpoints as strings, including those of grouped endpoints.
 
     A user's Zenoh file may group several addresses into one endpoint, which is then a table
     with the key "locators".
 
     Args:
-        endpoints: Endpoints as text, or such tables.
+        endpoints: Endpoints as strings, or such tables.
 
     Returns:
         All addresses, in the order of the endpoints.
@@ -48,17 +48,18 @@ def find_endpoint_addresses(endpoints: Iterable[Endpoint]) -> list[str]:
 
 
 def check_hosts(endpoints: Iterable[Endpoint]) -> None:
-    """Checks that the host names of all endpoints can be resolved to addresses.
+    """Raises UnknownHost if the host name of an endpoint cannot be resolved.
 
-    Zenoh would try to resolve an unknown name forever, so the names are checked before a
-    connection is opened. IP addresses need no check.
+    The check comes before any connection is opened, since Zenoh would retry an unknown name
+    forever. IP addresses are not checked.
 
     Args:
-        endpoints: Endpoints such as tcp/arm.example:7447, or web addresses such as
+        endpoints: Endpoints such as tcp/arm.example:7447, web addresses such as
             tcp://arm.example:8786, or tables that group several endpoints.
 
     Raises:
-        UnknownHost: A host name cannot be resolved. The error is about the first such endpoint.
+        UnknownHost: A host name cannot be resolved. The error refers to the first such
+            endpoint.
     """
     for address in find_endpoint_addresses(endpoints):
         match = _ENDPOINT.fullmatch(address)
@@ -70,7 +71,7 @@ def check_hosts(endpoints: Iterable[Endpoint]) -> None:
 def _is_address(host: str) -> bool:
     """Returns True if a host is a numeric address, for example 127.0.0.1 or fe80::1%eth0.
 
-    A numeric address needs no request to a name service, which could take seconds.
+    Numeric addresses do not require a name service lookup, which could take seconds.
     """
     try:
         ipaddress.ip_address(host.partition("%")[0])
@@ -80,11 +81,11 @@ def _is_address(host: str) -> bool:
 
 
 def _resolve(host: str, endpoint: str) -> None:
-    """Checks that a host name in a network address can be resolved, before it is used.
+    """Raises UnknownHost if the host name of an endpoint cannot be resolved.
 
     Args:
         host: The host name.
-        endpoint: Endpoint that contains it, for the error message.
+        endpoint: Endpoint that contains the host name, for the error message.
 
     Raises:
         UnknownHost: The host name cannot be resolved.

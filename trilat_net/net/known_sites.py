@@ -1,14 +1,13 @@
-"""Remembers which arms run on this machine, so that `trilat stop` reaches them immediately.
+"""Remembers which arms run on this machine, so that `trilat stop` can reach them immediately.
 
-The process that controls an arm (the site) stores its network endpoints in a small file while
-it runs. `trilat stop` reads these files and connects to the sites at once, instead of first
-searching for the session on the network.
+While a site runs, it stores its network endpoints in a small file. `trilat stop` reads these
+files and connects to the sites at once, instead of first searching the network for the session.
 
 Invariant:
-    - The files are only a shortcut. A site runs without its file, and a file whose process is
-      gone is ignored.
-    - Only the user who runs the site can read the file.
-    - If the arms cannot be stopped in this way, the command continues with the search for the
+    - The files are only a shortcut. A site runs without its file, and a file whose process no
+      longer exists is ignored.
+    - A file can only be read by the user who runs the site.
+    - If the arms cannot be stopped in this way, the command falls back to searching for the
       session.
 """
 
@@ -37,18 +36,18 @@ QUERY_PERIOD_NS = 50_000_000
 POLL_NS = 1_000_000
 """Time between two polls for replies, in ns."""
 PATIENCE_NS = 1_500_000_000
-"""Time after which the command continues with the search for the session, in ns."""
+"""Time after which the command falls back to searching for the session, in ns."""
 _AT_ONCE = {"scouting": {"delay": 0}}
-"""Settings of Zenoh that avoid its delay before the first message."""
+"""Zenoh settings that avoid a delay before the first message."""
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-"""Flags that create a file, and fail if the file exists already."""
+"""Flags for creating a file, which fail if the file already exists."""
 
 
 class _KnownSite(msgspec.Struct, frozen=True):
     """Content of the file in which a running site stores how it can be reached.
 
-    A site is a process that runs one arm and its control loop. With this file, other programs
-    on the same machine find the site without searching the network.
+    With this file, other programs on the same machine find the site without searching the
+    network.
 
     Attributes:
         session: Name of the session.
@@ -59,7 +58,7 @@ class _KnownSite(msgspec.Struct, frozen=True):
         keyed: True if the site encrypts its messages with keys.
         places: Endpoints at which the site can be reached, and those of the members that it
             connects to.
-        stop: The message that stops the arm, encoded.
+        stop: The encoded message that stops the arm.
         pid: Number of the site's process in the operating system.
         machine: Identity of the machine's clock. It changes when the machine is restarted.
     """
@@ -76,10 +75,11 @@ class _KnownSite(msgspec.Struct, frozen=True):
 
 
 def _find_folder() -> Path:
-    """Returns the folder in which the sites of this user that run on this machine have a file.
+    """Returns the folder that contains one file for each site this user runs on this machine.
 
-    Other commands find a running session by these files. The folder is
-    ~/.local/state/trilat-net/running, unless XDG_STATE_HOME names another place.
+    Other commands use these files to find a running session. The folder is
+    ~/.local/state/trilat-net/running, or the corresponding folder below XDG_STATE_HOME if that
+    variable is set.
     """
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "trilat-net" / "running"
@@ -94,24 +94,22 @@ def make_site_known(
     connection: "Connection",
     stop: bytes,
 ) -> Iterator[None]:
-    """Publishes the endpoints of a site in a file, with which `trilat stop` finds the site.
+    """Publishes the endpoints of a site in a file, which lets `trilat stop` find the site.
 
-    This is a context manager: the file exists while the site runs, and is removed afterwards.
-    If the file cannot be written, the site runs without it, and `trilat stop` searches the
-    network instead.
+    This is a context manager: the file exists while the site runs and is removed afterwards. If
+    the file cannot be written, the site runs without it, and `trilat stop` searches the network
+    instead.
 
-    No file is written if the user has configured the network connection with a Zenoh file.
-    Other processes need the same Zenoh file to reach the site. Therefore the endpoints alone
-    would not help.
+    No file is written if the network connection is configured with a Zenoh file. Other
+    processes need that Zenoh file to reach the site, so the endpoints alone would not help.
 
     Args:
         session: Name of the session.
         site: Name of the site.
         sites: Names of all sites of the session.
-        boot: Random number that identifies this start of the site. It is part of the file's
-            name.
+        boot: Random number that identifies this start of the site. It is part of the file name.
         connection: Network connection of the site.
-        stop: The message that `trilat stop` sends to stop the arm, encoded.
+        stop: The encoded message that `trilat stop` sends to stop the arm.
     """
     endpoints = [*connection.listen, *(connection.connect or ())]
     known = _KnownSite(
@@ -142,15 +140,15 @@ def make_site_known(
 
 
 def find_known_sites(session: str) -> list[_KnownSite]:
-    """Lists the sites (arm controllers) of a session that run on this machine.
+    """Lists the sites of a session that run on this machine.
 
-    The files of sites whose process is gone are removed.
+    The files of sites whose process no longer exists are deleted.
 
     Args:
         session: Name of the session.
 
     Returns:
-        The content of the file of each site. Empty if no site of the session runs here.
+        The content of each site's file. Empty if no site of the session runs here.
     """
     running = []
     machine = SystemClock().identity()
@@ -169,8 +167,8 @@ def find_known_sites(session: str) -> list[_KnownSite]:
 def _is_alive(pid: int) -> bool:
     """Returns True if a process with this number exists.
 
-    The file of a site (arm controller) without a process is left over from a crash. On systems
-    other than POSIX, the process is assumed to exist, because the check could end it.
+    The file of a site whose process does not exist is left over from a crash. On non-POSIX
+    systems, the process is assumed to exist, because the check could terminate it.
     """
     with suppress(PermissionError):
         try:
@@ -182,10 +180,10 @@ def _is_alive(pid: int) -> bool:
 
 
 def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
-    """Returns the network addresses at which some sites can be reached, each once.
+    """Returns the endpoints at which the given sites can be reached, without duplicates.
 
     Args:
-        known_sites: The sites (arm controllers), as `find_known_sites` returns them.
+        known_sites: The sites, as returned by `find_known_sites`.
     """
     endpoints: list[Endpoint] = []
     for known in known_sites:
@@ -196,18 +194,18 @@ def _list_endpoints(known_sites: Sequence[_KnownSite]) -> list[Endpoint]:
 
 
 def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoint] | None:
-    """Finds the endpoints of a session whose sites (arm controllers) all run on this machine.
+    """Returns the endpoints of a session whose sites all run on this machine.
 
-    Every running site stores its endpoints in a file, so no search in the network is needed.
+    Every running site stores its endpoints in a file, so the network does not have to be
+    searched.
 
     Args:
         session: Name of the session.
-        connection: Network connection of this process. Sites with another mode are ignored.
-            Sites with keys are ignored if this process has no keys, and sites without keys if
-            it has.
+        connection: Network connection of this process. Sites in another mode are ignored, as
+            are sites with keys if this process has none, and sites without keys if it has some.
 
     Returns:
-        The endpoints. None if not all sites of the session are known.
+        The endpoints, or None unless all sites of the session are known.
     """
     has_keys = bool(connection.keys_of)
     known_sites = [
@@ -225,19 +223,19 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 
 
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
-    """Stops arms immediately, as the command line of `trilat stop` requests.
+    """Stops arms immediately, as requested by the command line of `trilat stop`.
 
-    Only sites that run on this machine can be stopped in this way, because their endpoints are
-    read from local files. No other part of the program is loaded first, so that the arms stop
-    without delay.
+    Only sites on this machine can be stopped in this way, because their endpoints are read from
+    local files. No other part of the program is loaded first, which lets the arms stop without
+    delay.
 
     Args:
         arguments: Command line after `trilat stop`.
 
     Returns:
         The exit code of the command if all arms have been stopped or if the keys are missing.
-        Otherwise the arguments for the full command, which continues, for example by searching
-        the network for the remaining sites.
+        Otherwise, the arguments for the full command, which then continues, for example by
+        searching the network for the remaining sites.
     """
     options, sites, is_simple = _parse_arguments(arguments)
     session = options["--session"]
@@ -276,12 +274,12 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
 
 
 def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str], bool]:
-    """Parses the command line after `trilat stop`, without the full command-line library.
+    """Parses the command line after `trilat stop` without the full command-line library.
 
-    The library is not used because it takes time to load.
+    Loading the library would take too long.
 
     Returns:
-        The values of --session and --keys, empty if they are absent; all other arguments; and
+        The values of --session and --keys, which are empty if absent; all other arguments; and
         True if the other arguments contain no option.
     """
     options = {"--session": "", "--keys": ""}
@@ -299,20 +297,20 @@ def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str
 
 
 def _print(text: object) -> None:
-    """Prints a text immediately, with a replacement for characters that cannot be printed.
+    """Prints a message immediately, replacing characters that cannot be printed.
 
-    Texts from the network could otherwise send control sequences to the terminal.
+    Text from the network could otherwise send control sequences to the terminal.
     """
     letters = (letter if letter.isprintable() else "\ufffd" for letter in str(text))
     print("".join(letters), flush=True)
 
 
 def _order_stop(known_sites: Sequence[_KnownSite], sites: Sequence[str], keys: str) -> bool:
-    """Sends the order to stop to sites until each has replied, and prints the replies.
+    """Sends the stop command to sites until each has replied, and prints the replies.
 
-    If two sessions with the same name run on this machine, the sites of both are stopped. A
-    query is complete when as many replies have arrived as there are sites with the queried
-    name.
+    If two sessions with the same name are running on this machine, the sites of both are
+    stopped. A query is complete when as many replies have arrived as there are sites with the
+    queried name.
 
     Args:
         known_sites: The known sites of the session.
@@ -320,7 +318,7 @@ def _order_stop(known_sites: Sequence[_KnownSite], sites: Sequence[str], keys: s
         keys: Folder of the user's keys. Empty if there are none.
 
     Returns:
-        True if all sites have replied that they stop.
+        True if all sites have confirmed that they stop.
     """
     settings: Any = _AT_ONCE
     if keys:

@@ -1,20 +1,19 @@
-"""Creates, renews and reads the keys with which the processes of a session prove who they are.
+"""Creates, renews and reads the keys that prove the identity of a session's processes.
 
-Without keys, any program that can reach the process of an arm over the network could send
-messages to it. `trilat keys new` creates a private certificate authority for the session, which
-signs one certificate per member, that is per process that takes part, such as the process of an
-arm. Zenoh, the library that transports the messages, encrypts all connections with these keys
-(TLS or QUIC with certificates of both ends).
+Without keys, any program that can reach a site over the network could send it messages. `trilat
+keys new` creates a private certificate authority for the session and signs one certificate per
+member. Zenoh, the library that transports the messages, uses these keys to encrypt all
+connections (TLS or QUIC with certificates at both ends).
 
-Every member loads the keys in its own folder. The folder contains its private key, its
-certificate, the certificate of the authority, and the list of all members, from which the
-access rules are derived. No other user of the machine can read the private key or change a file
-in the folder. The private key of the authority has a separate folder, which should be stored
-safely.
+Each member loads the keys from its own folder. The folder contains its private key, its
+certificate, the certificate of the authority and a list of all members, from which the access
+rules are derived. No other user of the machine can read the private key or change a file in the
+folder. The private key of the authority is kept in a separate folder, which should be stored in
+a safe place.
 
-The keys expire one day earlier than their certificate. During this day, no member can start
-with the keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid
-certificate for each new connection, and each time a connection is opened again.
+The keys expire one day before their certificate. During this day, no member can start with the
+keys, but `trilat stop` can still connect and stop the arms. Zenoh needs a valid certificate
+whenever it opens or reopens a connection.
 """
 
 import datetime
@@ -48,23 +47,23 @@ from ..files import (
 from .zenoh_config import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY = "authority.pem"
-"""Name of the file with the certificate of the authority."""
+"""Name of the file that contains the certificate of the authority."""
 CERTIFICATE = "certificate.pem"
-"""Name of the file with the certificate of the member."""
+"""Name of the file that contains the certificate of the member."""
 PRIVATE_KEY = "private.key"
-"""Name of the file with the private key of the member."""
+"""Name of the file that contains the private key of the member."""
 MEMBERS = "members.json"
-"""Name of the file with the list of all members and the end of the keys."""
+"""Name of the file that lists all members and the expiry of the keys."""
 _AUTHORITY_FOLDER = "authority"
 """Name of the folder of the authority."""
 HERE = ("localhost", "127.0.0.1", "::1")
-"""Names and addresses of the local machine, which every certificate contains."""
+"""Names and addresses of the local machine, which are included in every certificate."""
 STOPPING_TIME = datetime.timedelta(days=1)
-"""Time after the end of the keys for which they can still be used to stop arms."""
+"""Time after the expiry of the keys during which they can still be used to stop arms."""
 _CLOCK_TOLERANCE = datetime.timedelta(hours=1)
-"""Difference between the clocks of two machines that is tolerated."""
+"""Tolerated difference between the clocks of two machines."""
 _MOST_KEY_BYTES = 65_536
-"""Largest number of bytes that are read from a key file."""
+"""Maximum number of bytes that are read from a key file."""
 _RENEWAL = (
     "renew the keys with trilat keys renew, or make new keys for all members with trilat keys "
     "new"
@@ -73,22 +72,22 @@ _RENEWAL = (
 _DATE = "%Y-%m-%d %H:%M UTC"
 """Format of dates in messages to the user."""
 _MOST_DAYS = 3_650
-"""Longest validity of keys, in days."""
+"""Maximum validity of keys, in days."""
 MOST_LETTERS = 64
-"""Longest name of a member. X.509 limits common names to 64 characters."""
+"""Maximum length of a member's name. X.509 limits common names to 64 characters."""
 
 
 class MemberKeys(NamedTuple):
-    """Cryptographic keys by which one process of a session proves its identity.
+    """Cryptographic keys with which one member of a session proves its identity.
 
     Attributes:
-        member: Name of the member, a process that takes part in the session.
-        members: Names of all members of the session that the keys were created for.
-        ends: Time at which the validity of the keys ends, in UTC. The certificate is valid for
-            `STOPPING_TIME` longer, so that the keys can still be used to stop arms.
+        member: Name of the member.
+        members: Names of all members of the session for which the keys were created.
+        ends: Expiry time of the keys, in UTC. The certificate remains valid for another
+            `STOPPING_TIME`, so that the keys can still be used to stop arms.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
-        hosts: Names and addresses at which other members can reach the member. Nobody can
-            connect to a member at any other address.
+        hosts: Names and addresses under which other members can reach this member. Connections
+            to any other address fail.
     """
 
     member: str
@@ -107,15 +106,15 @@ def create_keys(
     """Creates a folder of keys for each member of a session, as `trilat keys new` does.
 
     With keys, the members encrypt their messages and prove their identities. The keys are
-    signed by an authority, which is also created and can renew them later.
+    signed by an authority, which is created along with them and can renew them later.
 
     >>> [folder.name for folder in tn.create_keys("keys", ["m", "s", "recorder"])]
     ['m', 's', 'recorder']
 
     Args:
         folder: Folder to create. If it exists, it must be empty.
-        members: Names of the sites, and `recorder`, `operator` and `router` if they take part.
-        hosts: Names and addresses at which members listen, in addition to those of the local
+        members: Names of the sites, plus `recorder`, `operator` and `router` if they take part.
+        hosts: Names and addresses on which members listen, in addition to those of the local
             machine.
         days: Validity of the keys, in days.
 
@@ -123,8 +122,8 @@ def create_keys(
         The folders of the members.
 
     Raises:
-        UsageError: A name is not valid, or the folder is not empty or cannot be created.
-        LogRefused: The disk refused to write. No files are left.
+        UsageError: A name is invalid, or the folder is not empty or cannot be created.
+        LogRefused: Writing to the disk failed. No files are left behind.
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
@@ -149,13 +148,13 @@ def create_keys(
 
 
 def _find_name_fault(members: Sequence[Any]) -> str:
-    """Checks names of members (processes of a session), and describes the first fault.
+    """Describes the first fault in the names of members, as a sentence for the user.
 
     Args:
         members: The names.
 
     Returns:
-        The fault, as a sentence for the user. Empty if all names are valid.
+        The fault. Empty if all names are valid.
     """
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
@@ -175,9 +174,9 @@ def _find_name_fault(members: Sequence[Any]) -> str:
 
 
 def _find_host_fault(host: str) -> str:
-    """Checks that a certificate can contain a host name or an address.
+    """Explains why a certificate cannot contain a host name or an address.
 
-    Names with a port and patterns that stand for several hosts are refused.
+    Names with a port and patterns that stand for several hosts are rejected.
 
     Args:
         host: The name or address.
@@ -201,24 +200,24 @@ def _find_host_fault(host: str) -> str:
 def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) -> list[Path]:
     """Renews the certificates of members in place, as `trilat keys renew` does.
 
-    Private keys, host names and the lists of members are not changed.
+    Private keys, host names and member lists stay the same.
 
     >>> folders = tn.create_keys("lab-keys", ["m", "s"], days=1)
     >>> [folder.name for folder in tn.renew_keys("lab-keys", days=30)]
     ['m', 's']
 
     Args:
-        folder: Folder that `create_keys` created, including its folder `authority`.
+        folder: Folder created by `create_keys`, including its folder `authority`.
         members: Members whose certificates are renewed. If empty, all members that have a
             folder.
         days: Validity of the keys from now on, in days.
 
     Returns:
-        The renewed folders.
+        The folders whose certificates were renewed.
 
     Raises:
         UsageError: The authority, the folder of a member or a file in it is missing or damaged.
-        LogRefused: The disk refused to write.
+        LogRefused: Writing to the disk failed.
     """
     folder = Path(folder)
     if not 0 <= days <= _MOST_DAYS:
@@ -249,13 +248,10 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
 
 
 def _read_authority(folder: Path) -> tuple[x509.Certificate, Any]:
-    """Reads the certificate and the private key that sign the keys of all processes.
+    """Reads the certificate and private key of the authority that signs the members' keys.
 
     Args:
-        folder: Folder that `create_keys` created.
-
-    Returns:
-        The certificate and the private key.
+        folder: Folder created by `create_keys`.
 
     Raises:
         UsageError: The authority is missing or damaged.
@@ -286,20 +282,20 @@ def add_keys(
     hosts: Sequence[str] = (),
     days: int = 30,
 ) -> list[Path]:
-    """Creates keys for further members of a session, as `trilat keys add` does.
+    """Creates keys for additional members of a session, as `trilat keys add` does.
 
-    The keys of the other members stay valid. Only the list of all members in their folders, the
-    file members.json, is replaced.
+    The keys of the existing members stay valid. Only the list of all members in their folders
+    (members.json) is replaced.
 
     >>> folders = tn.create_keys("lab-keys", ["m", "s"])
     >>> [folder.name for folder in tn.add_keys("lab-keys", ["s2"])]
     ['s2']
 
     Args:
-        folder: Folder that `create_keys` created, with its folder `authority` and the folders
-            of all members.
+        folder: Folder created by `create_keys`, with its folder `authority` and the folders of
+            all members.
         members: Names of the new members.
-        hosts: Names and addresses at which the new members listen, in addition to those of the
+        hosts: Names and addresses on which the new members listen, in addition to those of the
             local machine.
         days: Validity of the new keys, in days.
 
@@ -307,9 +303,9 @@ def add_keys(
         The folders of the new members.
 
     Raises:
-        UsageError: A name is not valid or in use, or the authority or the folder of a member is
-            missing or damaged.
-        LogRefused: The disk refused to write. The folder is as it was before.
+        UsageError: A name is invalid or already in use, or the authority or the folder of a
+            member is missing or damaged.
+        LogRefused: Writing to the disk failed. The folder is unchanged.
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
@@ -354,13 +350,13 @@ def add_keys(
 
 
 def _read_member_lists(folder: Path) -> dict[str, dict[str, Any]]:
-    """Reads the lists of members (processes of a session) in the folders of all members.
+    """Reads the lists of members in the folders of all members.
 
     Args:
-        folder: Folder of the keys of all members.
+        folder: Folder that contains the keys of all members.
 
     Returns:
-        The content of the file `MEMBERS` of each member, by the name of the member.
+        A mapping from the name of each member to the content of its file `MEMBERS`.
 
     Raises:
         UsageError: A list is missing or damaged, or two lists have different members.
@@ -390,10 +386,10 @@ def _read_member_lists(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def _read_member_list(folder: Path, name: str) -> dict[str, Any]:
-    """Reads the list of members (processes of a session) in the folder of one member.
+    """Reads the list of members in the folder of one member.
 
     Args:
-        folder: Folder of the keys of all members.
+        folder: Folder that contains the keys of all members.
         name: Name of the member.
 
     Returns:
@@ -424,16 +420,16 @@ def _add_folders(
     files: dict[Path, str],
     write: Callable[[Path], None],
 ) -> None:
-    """Adds folders of members (processes of a session) and replaces files, or changes nothing.
+    """Adds folders for members and replaces files. If this fails, nothing is changed.
 
     Args:
-        folder: Folder of the keys of all members.
+        folder: Folder that contains the keys of all members.
         members: Names of the new folders.
-        files: New contents of existing files.
-        write: Function that writes the new folders into the folder that it gets.
+        files: Mapping from existing file to new content.
+        write: Function that writes the new folders into the folder passed to it.
 
     Raises:
-        LogRefused: The disk refused to write. The folder is as it was before.
+        LogRefused: Writing to the disk failed. The folder is unchanged.
     """
     old_contents = {path: path.read_text(encoding="utf-8") for path in files}
     try:
@@ -464,14 +460,14 @@ def _renew_member(
     authority_key: Any,
     ends: datetime.datetime,
 ) -> tuple[x509.Certificate, str]:
-    """Signs a new certificate for the existing private key of one process.
+    """Signs a new certificate for the existing private key of one member.
 
     Args:
         folder: Folder of the member.
         authority: Previous certificate of the authority, which must have signed the previous
             certificate of the member.
         authority_key: Private key of the authority.
-        ends: End of the keys.
+        ends: Expiry time of the keys.
 
     Returns:
         The new certificate, and the new content of the list of members.
@@ -510,12 +506,12 @@ def _write_all_keys(
     hosts: Sequence[str],
     days: int,
 ) -> None:
-    """Creates the folders of the authority and of all members (processes of a session).
+    """Creates the folders of the authority and of all members.
 
     Args:
         folder: Folder in which they are created.
         members: Names of the members.
-        hosts: Names and addresses at which members listen.
+        hosts: Names and addresses on which members listen.
         days: Validity of the keys, in days.
     """
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
@@ -535,16 +531,16 @@ def _write_member_keys(
     authority_key: Any,
     ends: datetime.datetime,
 ) -> None:
-    """Creates the folders of members (processes of a session), with a new private key for each.
+    """Creates the folders of members, each with a new private key.
 
     Args:
         folder: Folder in which they are created.
         members: Names of the members whose folders are created.
         all_members: Names of all members of the session.
-        hosts: Names and addresses at which the members listen.
+        hosts: Names and addresses on which the members listen.
         authority: Certificate of the authority.
         authority_key: Private key of the authority.
-        ends: Time at which the keys expire.
+        ends: Expiry time of the keys.
     """
     for member in members:
         member_key = ec.generate_private_key(ec.SECP256R1())
@@ -563,12 +559,12 @@ def _write_member_keys(
 def _format_member_list(member: str, members: Sequence[str], ends: datetime.datetime) -> str:
     """Returns the names of all members and the expiry of their keys as JSON.
 
-    Each member (process of a session) has this text in the file `MEMBERS` beside its keys.
+    Each member has this JSON in its file `MEMBERS`, next to its keys.
 
     Args:
         member: Name of the member.
         members: Names of all members.
-        ends: Time at which the keys expire.
+        ends: Expiry time of the keys.
     """
     content = {"member": member, "members": list(members), "ends": ends.isoformat()}
     return f"{json.dumps(content)}\n"
@@ -579,11 +575,11 @@ def _sign_authority(
 ) -> x509.Certificate:
     """Returns the certificate of the authority that signs the certificates of all members.
 
-    No higher authority exists, so the authority signs its own certificate.
+    The certificate is self-signed, since there is no higher authority.
 
     Args:
         key: Private key of the authority.
-        ends: Time at which the keys expire.
+        ends: Expiry time of the keys.
     """
     constraints = x509.BasicConstraints(ca=True, path_length=0)
     builder = _start_certificate(_ISSUER, key.public_key(), ends)
@@ -600,11 +596,11 @@ def _sign_member(
     """Returns a certificate for the public key of a member, signed by the authority.
 
     Args:
-        subject: Name of the member (process of a session).
+        subject: Name of the member.
         public_key: Public key of the member.
-        names: Host names and addresses at which the member may listen.
+        names: Host names and addresses on which the member may listen.
         authority_key: Private key of the authority.
-        ends: End of the keys.
+        ends: Expiry time of the keys.
     """
     uses = x509.ExtendedKeyUsage(
         [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -616,7 +612,7 @@ def _sign_member(
 
 
 def _make_subject(common_name: str) -> x509.Name:
-    """Returns an X.509 name for a certificate that states whom it is for, "m1" for example."""
+    """Returns the X.509 name that identifies the holder of a certificate, for example "m1"."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
@@ -627,12 +623,12 @@ _ISSUER = _make_subject("trilat-net authority")
 def _start_certificate(
     subject: x509.Name, public_key: Any, ends: datetime.datetime
 ) -> x509.CertificateBuilder:
-    """Returns an unsigned certificate with the fields that all certificates have.
+    """Returns an unsigned certificate with the fields common to all certificates.
 
     Args:
-        subject: Name of the member (process of a session), or of the authority.
+        subject: Name of the member or the authority.
         public_key: Public key of the member or the authority.
-        ends: Time at which the keys expire. The certificate expires `STOPPING_TIME` later.
+        ends: Expiry time of the keys. The certificate expires `STOPPING_TIME` later.
     """
     return (
         x509.CertificateBuilder()
@@ -646,14 +642,14 @@ def _start_certificate(
 
 
 def _encode(certificate: x509.Certificate) -> bytes:
-    """Returns a certificate in PEM format, in which Zenoh reads it."""
+    """Encodes a certificate in PEM format, as required by Zenoh."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
-    """Returns the host names and addresses for which a certificate is valid, in its format.
+    """Returns the host names and addresses for which a certificate is valid, as X.509 objects.
 
-    A connection to a member under any other name or address is refused.
+    Connections to a member under any other name or address fail.
 
     Args:
         hosts: Names and addresses in addition to those of the local machine.
@@ -670,8 +666,8 @@ def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName
 def _list_hosts(certificate: x509.Certificate) -> tuple[str, ...]:
     """Returns the host names and addresses for which the certificate of a member is valid.
 
-    A connection to a member (process of a session) is refused if the endpoint names another
-    host. The result is empty if the certificate states no hosts or cannot be read.
+    Connections to a member fail if the endpoint names another host. The result is empty if the
+    certificate names no hosts or cannot be read.
     """
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
@@ -690,13 +686,13 @@ def _write_folder(
     certificate: x509.Certificate,
     key: ec.EllipticCurvePrivateKey,
 ) -> None:
-    """Creates the folder of a member (process of a session), or that of the authority.
+    """Creates the folder of a member or of the authority.
 
     Args:
         folder: The folder.
         authority: Certificate of the authority.
-        certificate: Certificate of the member. For the authority's own folder it is the same
-            object as `authority`, and is written only once.
+        certificate: Certificate of the member. For the authority's own folder, pass the same
+            object as `authority`; it is then written only once.
         key: Private key that belongs to the certificate.
     """
     folder.mkdir(mode=0o700, parents=True)
@@ -727,9 +723,9 @@ def _write_new_file(path: Path, content: bytes) -> None:
 
 
 def _read_trusted(path: Path) -> bytes:
-    """Reads a key file, after a check that no other user of the machine can change it.
+    """Reads a key file, provided no other user of the machine can change it.
 
-    With a changed file, an unknown process could join the session.
+    Otherwise, an unknown process could join the session with a manipulated file.
 
     Raises:
         UsageError: Another user can change the file.
@@ -741,10 +737,10 @@ def _read_trusted(path: Path) -> bytes:
 
 
 def _check_permissions(path: Path, status: os.stat_result) -> None:
-    """Checks that no other user can change a file or folder.
+    """Raises UsageError if another user can change a file or folder.
 
-    In a folder with the sticky bit, users cannot change the files of others. Therefore such a
-    folder may be shared. On Windows, permission bits do not show who can write, and nothing is
+    In a folder with the sticky bit, users cannot change the files of others, so such a folder
+    may be shared. On Windows, permission bits do not show who can write, and nothing is
     checked.
 
     Args:
@@ -773,22 +769,22 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
 
 
 def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
-    """Reads and checks the keys in the folder of a member, as `trilat keys info` does.
+    """Reads and checks the keys in a member's folder, as `trilat keys info` does.
 
     >>> tn.read_member_keys(tn.create_keys("lab-keys", ["m", "s"])[0]).member
     'm'
 
     Args:
-        folder: Folder of one member, a process that takes part in a session.
-        stops: True if the keys are only used to stop arms. Keys whose validity has ended are
-            then still accepted for `STOPPING_TIME`, until their certificate ends as well.
+        folder: Folder of one member.
+        stops: True if the keys are only used to stop arms. Expired keys are then accepted for
+            another `STOPPING_TIME`, until their certificate expires too.
 
     Returns:
         The keys.
 
     Raises:
-        UsageError: A file is missing or damaged, the validity of the keys has ended, or the
-            files do not belong together.
+        UsageError: A file is missing or damaged, the keys have expired, or the files do not
+            belong together.
     """
     folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():
@@ -856,7 +852,7 @@ def _find_key_fault(
     key: Any,
     ends: datetime.datetime,
 ) -> str:
-    """Returns the first fault in the keys of a process. Empty if the keys are valid.
+    """Describes the first fault in the keys of a member. Empty if the keys are valid.
 
     Args:
         folder: Folder of the member.
@@ -864,7 +860,7 @@ def _find_key_fault(
         members: Names of all members.
         certificate: Certificate of the member.
         key: Private key of the member.
-        ends: Time until which the keys can be used.
+        ends: Expiry time of the keys.
     """
     common_name = ", ".join(
         name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns
@@ -906,10 +902,10 @@ def _find_key_fault(
 
 
 def _make_settings(folder: Path, members: Sequence[str]) -> dict[str, Any]:
-    """Returns the Zenoh settings with which a process uses its keys for encryption.
+    """Returns the Zenoh settings that make a member use its keys for encryption.
 
     Args:
-        folder: Folder of the member (process of a session).
+        folder: Folder of the member.
         members: Names of all members, whose access rules are part of the settings.
     """
     tls = {

@@ -1,24 +1,24 @@
-"""Determines which processes take part in a session, and which of them are present.
+"""Keeps track of which processes take part in a session, and which of them are present.
 
-These processes are called members. A member is a site, which runs one arm and its control loop,
-or a recorder, which writes the log. Members find each other in two ways. Each member declares a
-Zenoh liveliness token, so that the network itself reports when the member appears and
-disappears. Each member also replies to queries with its identity (`Info`): the scenario, the
-clock, the state of the session, and the boot. The boot is a random number that distinguishes a
-start of a process from earlier and later starts.
+These processes are called members: a site runs one arm and its control loop, and a recorder
+writes the log. Members find each other in two ways. Each member declares a Zenoh liveliness
+token, which lets the network itself report when the member appears and disappears. Each member
+also replies to queries with its identity (`Info`): the scenario, the clock, the state of the
+session, and the boot. The boot is a random number that distinguishes one start of a process
+from all others.
 
 Invariant:
-    - A site gives up if the session runs already, if another member has another scenario, or if
-      the same site was started twice. This is decided when the first identity arrives, before
-      any arm has moved.
+    - A site gives up if the session is already running, if another member has a different
+      scenario, or if the same site was started twice. This is decided when the first identity
+      arrives, before any arm has moved.
     - A site may join a running session only if `LateSites.may_join_late` is True. This requires
-      that every site of the scenario waits for its peers and aligns with them before it moves,
-      because the arms would otherwise jump.
+      every site of the scenario to wait for its peers and align with them before moving;
+      otherwise the arms would jump.
     - A recorder may join a running session, and several recorders may be present. A recorder
-      that joins late reads the sites, the start time and the boots from the identities of the
+      that joins late obtains the sites, the start time and the boots from the identities of the
       running sites.
     - Replies from programs that are not members of the session are ignored. The reason why they
-      cannot be read is kept for the error message.
+      cannot be decoded is kept for the error message.
 """
 
 import hashlib
@@ -42,10 +42,10 @@ from .wire import M, decode, encode, split_states
 
 
 def new_boot() -> int:
-    """Returns a random 64-bit number that identifies one start of one process.
+    """Returns a random 64-bit number that identifies one start of a process.
 
-    If a process is restarted under the same name, the other processes recognise the new one by
-    the new number.
+    If a process is restarted under the same name, other processes recognise the new instance by
+    its new number.
     """
     return secrets.randbits(64)
 
@@ -58,9 +58,10 @@ def describe_member(
     scenario: str = "",
     **fields: object,
 ) -> Info:
-    """Composes the identity with which a member introduces itself to the others of a session.
+    """Composes the identity with which a member introduces itself to the rest of the session.
 
-    A member is a process that takes part in a session.
+    The identity also contains the hash of the scenario, the name of the machine and the
+    identity of the clock.
 
     Args:
         member: Name of the member.
@@ -68,11 +69,7 @@ def describe_member(
         clock: Clock of the member.
         fingerprint: Fingerprint of the floating-point arithmetic on the member's platform.
         scenario: Text of the scenario file. Empty if the member does not know the scenario.
-        **fields: Further fields of `Info`.
-
-    Returns:
-        The identity, which also contains the scenario, the name of the machine and the identity
-        of its clock.
+        **fields: Other fields of `Info`.
     """
     digest = hashlib.sha256(scenario.encode()).hexdigest() if scenario else ""
     basic_fields = {
@@ -88,10 +85,10 @@ def describe_member(
 
 
 def liveliness_token(session: str, member: str, boot: int) -> str:
-    """Returns the key of the token that shows that one start of a member is present.
+    """Returns the key of the token that shows that a particular start of a member is present.
 
-    Zenoh tells all members of the session when a token appears, and when the process that
-    declared the token has disappeared.
+    Zenoh informs all members of the session when the token appears, and when the process that
+    declared it has disappeared.
 
     Args:
         session: Name of the session.
@@ -102,21 +99,20 @@ def liveliness_token(session: str, member: str, boot: int) -> str:
 
 
 def read_messages(inbox: Inbox, kind: type[M], layout: Layout | None = None) -> Iterator[M]:
-    """Removes all waiting messages from an inbox, and yields those of one type.
+    """Removes all waiting messages from an inbox, and yields those of the given type.
 
     Payloads that cannot be decoded as this type are skipped without an error, because any
-    program on the network can publish under the key of the inbox. Sites (arm controllers)
-    publish their records in blocks. If a record of a block cannot be decoded, the rest of the
-    block is skipped as well.
+    program on the network can publish under the key of the inbox. Sites publish their records
+    in blocks; if a record of a block cannot be decoded, the rest of the block is skipped too.
 
     Args:
-        inbox: Queue of the encoded messages that have arrived.
+        inbox: Queue of encoded messages.
         kind: Expected type of the messages.
-        layout: Expected numbers of joints and peers (other sites). A message that differs
-            counts as undecodable. If None, all numbers are accepted.
+        layout: Expected numbers of joints and peers. Messages with other numbers are treated as
+            undecodable. If None, all numbers are accepted.
 
     Yields:
-        The decoded messages, in the order of their arrival.
+        The decoded messages, in order of arrival.
     """
     while (message := inbox.poll()) is not None:
         _key, block = message
@@ -127,21 +123,22 @@ def read_messages(inbox: Inbox, kind: type[M], layout: Layout | None = None) -> 
 
 
 class EventPublisher:
-    """Publishes the events of one member, and replies to queries for the member's identity.
+    """Publishes the events of one member, and replies to queries for its identity.
 
     Events are numbered messages such as "start", "mode" or "end". The recorder stores them, and
-    the other members (processes of a session) react to them.
+    the other members react to them.
 
     Args:
         bus: Network connection of the member.
         session: Name of the session.
         info: Identity of the member.
-        keep: Function that receives the payload of every published event, for example to store
-            it until the recorder has it.
+        keep: Function that receives the payload of every published event, for example to keep
+            it until the recorder has received it.
 
     Attributes:
         info: Current identity of the member.
-        published: Number of events published so far. It is the number of the next event.
+        published: Number of events published so far, which is also the number of the next
+            event.
     """
 
     def __init__(
@@ -159,13 +156,13 @@ class EventPublisher:
         self._queries = bus.query_inbox(topics.key(session, info.member, topics.INFO))
 
     def publish(self, kind: str, text: str, **fields: object) -> Event:
-        """Publishes a notable occurrence (event) to all other processes, under the next number.
+        """Publishes an event to all other processes and gives it the next number.
 
         Args:
-            kind: Kind of the event, which programs read.
-            text: Sentence of the event, which people read.
-            **fields: Further fields of `Event`. They may also replace the basic fields, as when
-                an event is published again.
+            kind: Kind of the event, for programs.
+            text: Description of the event in one sentence, for people.
+            **fields: Other fields of `Event`. They may also override the basic fields, for
+                example when an event is published again.
 
         Returns:
             The event.
@@ -187,11 +184,11 @@ class EventPublisher:
     def publish_clocks(self, notices: Iterable[Mapping[str, Any]], t_ns: int) -> None:
         """Publishes events about the offsets and faults of the peers' clocks.
 
-        Recorders store these events, so that a reader of the log knows how well the clocks
+        Recorders store these events, which show readers of the log how closely the clocks
         agreed.
 
         Args:
-            notices: Fields of the events, by name.
+            notices: One mapping per event, from field name to value.
             t_ns: Time of the events, in ns since the epoch (the common start of the session).
         """
         for notice in notices:
@@ -201,29 +198,29 @@ class EventPublisher:
         """Changes fields of this process's identity, which other processes can query.
 
         Args:
-            **fields: New values of fields of `Info`. All other fields stay unchanged.
+            **fields: New values for fields of `Info`. All other fields stay the same.
         """
         self.info = msgspec.structs.replace(self.info, **fields)
 
     def answer_queries(self) -> None:
-        """Replies to all waiting queries of other processes with the identity of this process.
+        """Answers all pending queries from other processes with the identity of this process.
 
-        The method does not wait, so that a control loop may call it.
+        Never waits, so a control loop can call it.
         """
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
 
 
 class LateSites(NamedTuple):
-    """Whether a site may join a running session, and which sites a start waits for.
+    """Specifies whether a site may join a running session, and which sites a start waits for.
 
     Attributes:
-        may_join_late: True if this site (arm controller) may join a running session. The caller
-            sets it only if every site of the scenario waits for the other sites and aligns its
-            arm with them before it moves, because the arms would otherwise jump.
+        may_join_late: True if this site may join a running session. Set it only if every site
+            of the scenario waits for the other sites and aligns its arm with them before
+            moving; otherwise the arms would jump.
         not_awaited: Names of the sites that the session does not wait for at its start. Only
-            the leader, the first site of the scenario, uses this field.
-        rate_hz: Tick rate of this site: periods of its control loop per second.
+            used by the leader, which is the first site of the scenario.
+        rate_hz: Tick rate of this site, in Hz.
     """
 
     may_join_late: bool = False
@@ -232,10 +229,10 @@ class LateSites(NamedTuple):
 
 
 class Membership:
-    """List of the other members of a session, kept up to date by one member.
+    """A member's up-to-date list of the other members of the session.
 
-    A site (arm controller) uses this list to decide when the session can start. A recorder uses
-    it to learn the sites, and to join a running session.
+    A site uses this list to decide when the session can start. A recorder uses it to find out
+    which sites exist, and to join a running session.
 
     Args:
         bus: Network connection of this member.
@@ -243,14 +240,14 @@ class Membership:
         session: Name of the session.
         publisher: Publishes the events of this member.
         sites: Names of the scenario's sites. The first one is the leader. Empty for a recorder,
-            which learns the sites from the members.
-        late: Rules about sites that join while the session runs.
+            which obtains the sites from the members.
+        late: Rules for sites that join while the session is running.
 
     Attributes:
-        others: Identity of each other member that is present and has introduced itself, by
-            name.
-        alive: Boots (numbers of process starts) of the members that are present, as text.
-        gone: Boots of the members that have disappeared, as text.
+        others: Mapping from name to identity for each other member that is present and has
+            introduced itself.
+        alive: Boots of the members that are present, as strings.
+        gone: Boots of the members that have disappeared, as strings.
     """
 
     def __init__(
@@ -262,7 +259,7 @@ class Membership:
         sites: Sequence[str],
         late: LateSites,
     ) -> None:
-        """Subscribes to the presence of a session's processes, none of which is known yet."""
+        """Subscribes to the presence of a session's members. None of them is known yet."""
         self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
@@ -286,19 +283,18 @@ class Membership:
 
     @property
     def is_leader(self) -> bool:
-        """True if this process is the leader of the session: the first site of the scenario.
+        """True if this process is the leader (the first site of the scenario).
 
-        The leader decides when the session starts, and all other sites (arm controllers) follow
-        its schedule.
+        The leader decides when the session starts, and all other sites follow its schedule.
         """
         return self._sites[:1] == (self.local_info.member,)
 
     @property
     def unreadable(self) -> dict[str, str]:
-        """Reasons why the replies of members could not be decoded, by the name of the member.
+        """Reasons why replies could not be decoded, keyed by the name of the member.
 
-        For example, a member (process of a session) may run another version of the program.
-        Empty if all replies could be decoded.
+        This happens, for example, if a member runs another version of the program. Empty if all
+        replies could be decoded.
         """
         expected_members = (*self._sites, topics.RECORDER)
         return {
@@ -308,24 +304,18 @@ class Membership:
         }
 
     def boots(self) -> dict[str, int]:
-        """Returns the members that are present, including this one, with the boot of each.
+        """Maps the name of each member present, including this one, to its boot.
 
-        The boot is the random number that identifies the start of the member's process.
-
-        Returns:
-            The boots, by the name of the member.
+        The boot is the random number that identifies the start of a member's process.
         """
         boots = {name: info.boot for name, info in self.others.items()}
         return boots | {self.local_info.member: self.local_info.boot}
 
     def clocks(self) -> dict[str, str]:
-        """Returns the identity of the clock of each member that is present, including this one.
+        """Maps the name of each member present, including this one, to its clock identity.
 
-        Members whose clocks have the same identity run on the same machine. Therefore the times
-        of these members can be compared directly.
-
-        Returns:
-            The identities, by the name of the member.
+        Members with the same clock identity run on the same machine, so their times can be
+        compared directly.
         """
         clocks = {name: info.clock for name, info in self.others.items()}
         return clocks | {self.local_info.member: self.local_info.clock}
@@ -333,10 +323,9 @@ class Membership:
     def list_missing(self) -> list[str]:
         """Lists the members that must still appear before the session can start.
 
-        These are the sites (arm controllers) of the scenario that are not known yet, except
-        those that need not be awaited. The recorder is listed if it is not known yet, and
-        either a member (process of a session) needs it or its liveliness token shows that it is
-        about to join.
+        These are the sites of the scenario that are not known yet, except those that need not
+        be awaited. The recorder is included if it is not known yet and either a member requires
+        it or its liveliness token shows that it is about to join.
 
         Returns:
             The names. Empty if the session can start.
@@ -351,11 +340,11 @@ class Membership:
         return [name for name in awaited_members if name not in known_members]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """Returns True if a process is gone, and another process has taken its name.
+        """Returns True if a process has disappeared and another one has taken its name.
 
         Args:
             name: Name of the member.
-            boot: Number that identifies the start of the former process.
+            boot: Boot of the former process.
         """
         info = self.others.get(name)
         return info is not None and info.boot != boot and str(boot) not in self.alive
@@ -363,10 +352,10 @@ class Membership:
     def list_running(self) -> list[Info]:
         """Lists the running sites that agree on who takes part in the session.
 
-        Every running site (arm controller) states the members that it has admitted, each with
-        its boot, the number that identifies one start of a process. Two sites agree if they
-        state the same boots. The boot of this member is ignored in the comparison, because some
-        sites may have admitted this member already while others have not.
+        Every running site states the members that it has admitted and their boots. Two sites
+        agree if they state the same boots. The boot of this member is ignored in the
+        comparison, because it may already have been admitted by some sites and not yet by
+        others.
 
         Returns:
             The identities of the sites that agree with the first running site, sorted by name.
@@ -385,15 +374,14 @@ class Membership:
         return [info for info in running if info.boots | local_boot == expected_boots]
 
     def poll(self, *, may_have_started: bool) -> None:
-        """Updates the list of members: adds those that reply, and removes those that are gone.
+        """Updates the list of members: adds those that reply, and removes those that have left.
 
-        The query for the identities of the members (processes of a session) is repeated when it
-        is due. The method does not wait.
+        The query for the identities of the members is repeated when it is due. Never waits.
 
         Args:
-            may_have_started: True if this member has published that it is ready. From then on
-                the session may start before this member is informed. Therefore this member does
-                not give up if a site (arm controller) is already running.
+            may_have_started: True if this member has announced that it is ready. The session
+                may then start before this member is informed, so it does not give up if a site
+                is already running.
 
         Raises:
             SessionError: This member cannot be part of the session.
@@ -407,8 +395,8 @@ class Membership:
         """Updates the lists after the token of a member has appeared or disappeared.
 
         Args:
-            member: Name of the member (process of a session).
-            boot: Number of the member's start, as text, as in the key of the token.
+            member: Name of the member.
+            boot: Boot of the member, as the string contained in the key of the token.
             is_alive: True if the token has appeared.
         """
         is_recorder = member == topics.RECORDER
@@ -428,15 +416,16 @@ class Membership:
             del self.others[member]
 
     def receive_identity(self, info: Info, *, may_have_started: bool) -> None:
-        """Adds a process to the list of the session, or refuses it, when its identity arrives.
+        """Adds a member to the list when its identity arrives, or rejects it.
 
         Args:
             info: Identity of the member.
-            may_have_started: True if the session may have started already, see `poll`.
+            may_have_started: True if the session may already have started, see `poll`.
 
         Raises:
-            SessionError: This member cannot be part of the session. The session runs already,
-                has another scenario, or contains another process with the name of this member.
+            SessionError: This member cannot be part of the session because the session is
+                already running, has a different scenario, or contains another process with the
+                name of this member.
         """
         local = self.local_info
         is_recorder = info.member == topics.RECORDER
@@ -475,10 +464,10 @@ class Membership:
             self.others[info.member] = info
 
     def _may_join(self, info: Info) -> bool:
-        """Returns True if this member may join the session that runs according to `info`.
+        """Returns True if this member may join the running session described by `info`.
 
-        A recorder needs the boots of the session's members. A site must be allowed to join
-        late, and must not run in the session already.
+        A recorder only needs to know the boots of the session's members. A site must be allowed
+        to join late, and must not already be running in the session.
         """
         is_local_recorder = not self._sites
         if is_local_recorder:
@@ -488,7 +477,7 @@ class Membership:
     def _describe_difference(self, info: Info) -> str:
         """Returns a phrase about the settings in which the scenario of another member differs.
 
-        It begins with a semicolon. It is empty if no settings can be named.
+        The phrase begins with a semicolon, and is empty if no settings can be named.
 
         Args:
             info: Identity of the other member, with its scenario.
@@ -500,12 +489,11 @@ class Membership:
         return f"; {phrase}" if phrase else ""
 
     def _refuse(self, info: Info) -> None:
-        """Refuses a member whose scenario differs, or gives up if that member is the leader.
+        """Rejects a member whose scenario differs, or gives up if that member is the leader.
 
-        The scenario of the leader, the first site (arm controller), is that of the session. If
-        this member (process of a session) is the leader, it publishes once that the other
-        member is refused. If the other member is the leader, this member gives up. If neither
-        member is the leader, nothing happens.
+        The scenario of the leader (the first site) is that of the session. If this member is
+        the leader, it publishes once that the other member is rejected. If the other member is
+        the leader, this member gives up. If neither is the leader, nothing happens.
 
         Args:
             info: Identity of the other member.
@@ -534,24 +522,21 @@ class Membership:
 
 
 class Epoch(NamedTuple):
-    """Common start time of a session, as one member knows it.
+    """Common start time of a session (the time of tick 0), as known to one member.
 
-    The epoch is the time of tick 0. `SessionJoin.poll` returns this object when the members
-    have agreed on the epoch, or when this member was admitted to a running session.
-
-    A tick is one period of a site's control loop.
+    `SessionJoin.poll` returns this object when the members have agreed on the epoch, or when
+    this member has been admitted to a running session.
 
     Attributes:
         mono_ns: The epoch on the monotonic clock of this process.
-        unix_ns: The epoch in Unix time, as the leader's clock showed it.
-        boots: Number that identifies the start of each member's process, by name.
-        epochs: The epoch on each member's own monotonic clock, by name. Empty for a recorder
-            that joins late, which needs only its own clock.
-        first: First tick that this site (arm controller) executes. It is 0 unless the site
-            joins late.
-        coming: Event with which this site requested to join the running session. The site
-            publishes the event again until all peers confirm that they receive its samples
-            (sent states). None if the site was present from the start.
+        unix_ns: The epoch in Unix time, as read from the leader's clock.
+        boots: Mapping from name to boot for each member.
+        epochs: Mapping from the name of each member to the epoch on its own monotonic clock.
+            Empty for a recorder that joins late, which needs only its own clock.
+        first: First tick that this site executes. 0 unless the site joins late.
+        coming: Event with which this site asked to join the running session. The site keeps
+            publishing it until all peers confirm that they receive its samples. None if the
+            site was present from the start.
     """
 
     mono_ns: int

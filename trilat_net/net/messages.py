@@ -1,18 +1,16 @@
-"""Defines the messages that the members of a session publish, and that a log stores.
+"""Defines the messages that the members of a session publish and that a log stores.
 
-A member is a process that takes part in a session: a site, which runs one arm, or a recorder. A
-site publishes a `PeerSample` for the other sites and a `State` for the recorder in every tick
-of its control loop, `LinkStats` ten times a second, and an `Event` when something happens. A
-recorder publishes `RecorderStats` and events. Every member replies to queries with an `Info`.
+In every tick, a site publishes a `PeerSample` for the other sites and a `State` for the
+recorder. It publishes `LinkStats` ten times per second, and an `Event` when something happens.
+A recorder publishes `RecorderStats` and events. Every member replies to queries with an `Info`.
 
-The classes are the schema of the messages. A log contains their JSON Schema, which includes
+The classes serve as the schema of the messages. A log contains their JSON Schema, including
 their docstrings.
 
 Invariant:
-    - One definition serves three purposes: it validates a message, it yields the JSON Schema,
-      and it documents the format.
-    - The unit of each number is part of the field's name or of the schema (`x-unit`). All units
-      are SI units and radians.
+    - A single definition validates a message, yields its JSON Schema and documents its format.
+    - The unit of each quantity is part of the field's name or of the schema (`x-unit`). All
+      units are SI units and radians.
 """
 
 import ast
@@ -26,26 +24,26 @@ from msgspec import Meta
 from ..records import MAX_JOINTS, MAX_LAW_MEMORY, Layout, Mode, TickRecord
 
 VERSION = 4
-"""Version of the schema of sent messages. Messages of other versions are not accepted."""
+"""Schema version of sent messages. Messages with other versions are not accepted."""
 READABLE = (1, 2, 3, 4)
-"""Versions of the schema that can be read from files: all versions that were released."""
+"""Schema versions that can be read from files: all versions that were released."""
 SENT_TIME_SINCE = 2
-"""First version of the schema whose records contain the time at which they were sent."""
+"""First schema version whose records contain the time at which they were sent."""
 
 U64 = Annotated[int, Meta(ge=0)]
-"""A number from 0 to 2^64 - 1, such as the boot of a process."""
+"""An integer from 0 to 2^64 - 1, such as the boot of a process."""
 TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
-"""Number of a tick, or another count of the same size."""
+"""Number of a tick, or another count of the same magnitude."""
 Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
 """A reading of a clock in ns, within eighteen years of 0.
 
-The limit ensures that sums and differences of a few readings are still integers that a message
-can contain.
+The limit ensures that sums and differences of a few readings still fit into an integer that a
+message can contain.
 """
 Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
-"""Three numbers about the arrival of a sample, see `State.rx` and `State.echo`."""
+"""Three integers that describe the arrival of a sample, see `State.rx` and `State.echo`."""
 MOST_PEERS = 32
-"""Largest number of sites in a scenario."""
+"""Maximum number of sites in a scenario."""
 
 
 class ModeMeaning(NamedTuple):
@@ -53,13 +51,13 @@ class ModeMeaning(NamedTuple):
 
     Attributes:
         mode: The mode.
-        does: Words that describe the site in the present tense, as in "m1 follows".
-        did: Words that describe the site in the past tense, as in "m1 followed".
+        does: Phrase that describes the site in the present tense, as in "m1 follows".
+        did: Phrase that describes the site in the past tense, as in "m1 followed".
         follows: True if the arm follows the states of the peers.
         rests: True if the site brings its arm to rest in this mode, for example because the
             connection to a peer is interrupted. It then ignores the samples of its peers, and
             adds a braking torque to the torque of the control law.
-        halted: True if the site leaves this mode only when a user requests it.
+        halted: True if the site leaves this mode only at the request of a user.
     """
 
     mode: Mode
@@ -80,17 +78,17 @@ MODES = {
     "stopped": ModeMeaning(Mode.STOPPED, "is stopped", "stopped", rests=True, halted=True),
     "diverged": ModeMeaning(Mode.DIVERGED, "diverges", "diverged", follows=True),
 }
-"""Meanings of the modes, by their names in records and messages."""
+"""Mapping from the name of each mode in records and messages to its meaning."""
 MODE_WORDS = {meaning.mode: word for word, meaning in MODES.items()}
 """Name of each mode in records and messages."""
 HALTED_MODES = tuple(word for word, meaning in MODES.items() if meaning.halted)
-"""Names of the modes from which a site resumes only on request."""
+"""Names of the modes that a site leaves only on request."""
 RESTING_MODES = tuple(word for word, meaning in MODES.items() if meaning.rests)
 """Names of the modes in which an arm comes to rest."""
 
 
 def _unit(unit: str, text: str, **limits: Any) -> Meta:
-    """Returns the annotation of a field with its unit, its description and its limits."""
+    """Annotates a field with its unit, its description and its limits."""
     return Meta(description=text, extra_json_schema={"x-unit": unit}, **limits)
 
 
@@ -173,21 +171,19 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     bodies: list[float] = []
 
     def to_tick_record(self, peers: tuple[str, ...]) -> TickRecord:
-        """Converts the record to the object that an execution of the same tick returns.
+        """Converts the record to the object that `Site.step` returns for the same tick.
 
-        A tick is one period of the control loop, and a record is its stored result. The object
-        can be compared with the result of executing the tick again by `Site.step`. Most fields
-        are the same in both forms, and are explained in `TickRecord`. Three fields differ:
+        The result can be compared with a repeated execution of the tick. Most fields are the
+        same in both forms and are explained in `TickRecord`. Three fields differ:
 
         - The mode is a word in the log. An unknown word, as in the log of another version,
           becomes "diverged".
-        - `used`, the tick of the newest sample in use, is given by the name of the peer in the
-          log, and by the index of the peer in the object. -1 stands for no sample.
-        - `mem`, the memory of the site, is empty unless it is complete.
+        - `used` (the tick of the newest sample in use) is listed in the log by the name of the
+          peer, and in the object by the index of the peer. -1 means that there is no sample.
+        - `mem` (the memory of the site) is empty unless it is complete.
 
         Args:
-            peers: Names of the other sites (processes that each run one arm), in the order of
-                the scenario.
+            peers: Names of the other sites, in scenario order.
         """
         mode = MODES.get(self.mode, MODES["diverged"]).mode
         # The memory begins with a pose, which has as many numbers as `q_des`. A memory without
@@ -221,10 +217,10 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The state of an arm that its site sends to the peers in every tick.
 
-    It is the part of the tick's `State` that peers need, and each field has exactly the same
-    value. If the sites exchange positions in task space, `q`, `qd` and `tau_x` contain `x`,
-    `xd` and `wrench` of the `State`. `ch` contains what the control law sends to the laws of
-    the peers: a part for all peers, and a part for each peer.
+    It contains the part of the tick's `State` that peers need, with exactly the same values. If
+    the sites exchange positions in task space, `q`, `qd` and `tau_x` contain `x`, `xd` and
+    `wrench` of the `State`. `ch` contains what the control law sends to the laws of the peers:
+    one part for all peers, and one part for each peer.
     """
 
     v: int
@@ -403,13 +399,13 @@ class RecorderStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Identity of a member, with which it replies to queries.
+    """Identity of a member, which it sends in reply to queries.
 
     Attributes:
         v: Version of this schema.
         member: Name of the member.
         boot: Random number that identifies this start of the member's process.
-        scenario_sha256: Hash of the resolved scenario. Empty for a recorder, which learns the
+        scenario_sha256: Hash of the resolved scenario. Empty for a recorder, which obtains the
             scenario from the sites.
         scenario: Text of the resolved scenario. Empty for a recorder.
         host: Name of the member's machine.
@@ -417,14 +413,14 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
             same machine.
         fingerprint: Fingerprint of the floating-point arithmetic on the member's platform.
         needs_recorder: True if the member starts the session only when a recorder is present.
-        running: True if the epoch of the member's session, its common start time, is fixed.
+        running: True if the epoch of the session (its common start time) is fixed.
         ticks: Number of ticks that the member has executed.
         epoch_mono_ns: The epoch on the member's clock, once it is fixed.
         epoch_unix_ns: The epoch in Unix time.
-        boots: Boot of each member of the session, by name.
-        grid_ns: Time on the member's clock from which its ticks are counted at present. It
-            differs from the epoch if the member had to follow the drifting clock of the first
-            site.
+        boots: Mapping from name to boot for each member of the session.
+        grid_ns: Time on the member's clock from which its ticks are currently counted. It
+            differs from the epoch if the member has had to follow the drifting clock of the
+            first site.
     """
 
     v: int = VERSION
@@ -452,8 +448,7 @@ STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch", "hand", "bodies")
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
     """Returns the JSON Schema of a message type.
 
-    msgspec places the schema in a list of components. Programs that show logs expect it at the
-    root.
+    msgspec nests the schema in a list of components, whereas log viewers expect it at the root.
     """
     (_,), components = msgspec.json.schema_components([kind])
     schema: dict[str, Any] = components[kind.__name__]

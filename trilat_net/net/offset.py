@@ -12,25 +12,27 @@ each message therefore limits the offset at one time of the local clock:
 
 In an exchange with the stamps t1 (local sending), t2 (other receipt), t3 (other sending) and t4
 (local receipt), the ceiling is t2 - t1 and the floor is t3 - t4. Their mean is the classical
-estimate of the offset, as in NTP. Their difference is the round trip time, and half of it is
-the error bound.
+estimate of the offset, as used by NTP. Their difference is the round trip time, and half of the
+difference is the error bound.
 
-The time stamps are divided into windows. Of each window, only the lowest ceiling and the
-highest floor are kept. They may come from different exchanges. Therefore the error bound is
-half of the shortest delay in one direction plus half of the shortest delay in the other. Over
-the windows, the offset is modelled as a straight line. All lines below every ceiling and above
-every floor are admissible, and the range of their values at present is the range of the offset.
+The time stamps are divided into windows. Only the lowest ceiling and the highest floor of each
+window are kept, which may come from different exchanges. The error bound is therefore half of
+the shortest delay in one direction plus half of the shortest delay in the other. Across the
+windows, the offset is modelled as a straight line. Every line below all ceilings and above all
+floors is admissible, and the present values of the admissible lines form the range of the
+offset.
 
 Assumptions: the clocks drift apart by less than DRIFT_LIMIT, and their drift deviates from its
 mean by less than WANDER over the stored windows.
 
 Invariant:
-    - The time stamps prove each error bound, however long the delays are, and however different
-      they are in the two directions. No symmetry of the network is assumed.
+    - Each error bound follows from the time stamps alone, however long the delays are and
+      however much they differ between the two directions. The network is not assumed to be
+      symmetric.
     - Delays are computed with a smoothed offset (`SlewedOffset`) that never steps, because a
-      step would appear as a jump of all delays. The smoothed offset reaches each new estimate
+      step would appear as a jump in all delays. The smoothed offset reaches each new estimate
       within SLEW_NS, and then follows the estimated drift.
-    - The error bound of the smoothed offset is also valid while the offset still approaches a
+    - The error bound of the smoothed offset also holds while the offset is still approaching a
       new estimate.
 """
 
@@ -48,29 +50,29 @@ _Array = NDArray[np.float64]
 WINDOWS_KEPT = 60
 """Number of windows whose limits are stored."""
 DRIFT_LIMIT = 500_000.0
-"""Largest drift between two clocks, in ns/s."""
+"""Maximum drift between two clocks, in ns/s."""
 WANDER = 1_000.0
-"""Largest deviation of the drift from its mean over the stored windows, in ns/s."""
+"""Maximum deviation of the drift from its mean over the stored windows, in ns/s."""
 _NOISE_NS = 3_000.0
-"""Distance from the tightest limit at which the weight of a limit falls to a quarter, in ns."""
+"""Distance from the tightest limit at which the weight of a limit drops to a quarter, in ns."""
 _PRIOR_DRIFT = 100_000.0
-"""Standard deviation of the drift that is expected before any measurement, in ns/s.
+"""Standard deviation of the drift expected before any measurement, in ns/s.
 
-It matters only while the windows span less than a second.
+It only matters while the windows span less than a second.
 """
 _WEIGHTING_ROUNDS = 3
-"""Number of rounds of the reweighted least squares. Three are enough in practice."""
+"""Number of iterations of the reweighted least squares. Three are enough in practice."""
 
 
 class OffsetLimit(NamedTuple):
-    """Limit of the offset between two clocks that follows from the time stamps of one message.
+    """Limit on the offset between two clocks, derived from the time stamps of one message.
 
     A message cannot arrive before it was sent. A message in one direction therefore gives an
-    upper limit (ceiling), one in the other direction a lower limit (floor).
+    upper limit (ceiling), and one in the other direction a lower limit (floor).
 
     Attributes:
-        local_ns: Time on the local clock for which the limit holds, in ns.
-        offset_ns: The limit of the offset, the other clock minus the local clock, in ns.
+        local_ns: Time on the local clock at which the limit holds, in ns.
+        offset_ns: The limit on the offset (other clock minus local clock), in ns.
     """
 
     local_ns: int
@@ -84,8 +86,8 @@ class OffsetEstimate(NamedTuple):
         local_ns: Time on the local clock for which the estimate holds, in ns.
         offset_ns: The other clock minus the local clock at that time, in ns.
         drift: Growth of the offset, in ns/s.
-        low_ns, high_ns: Limits of the offset at that time, in ns.
-        drift_low, drift_high: Limits of the drift, in ns/s.
+        low_ns, high_ns: Limits on the offset at that time, in ns.
+        drift_low, drift_high: Limits on the drift, in ns/s.
     """
 
     local_ns: int
@@ -97,26 +99,23 @@ class OffsetEstimate(NamedTuple):
     drift_high: float
 
     def extrapolate_ns(self, local_ns: int) -> int:
-        """Returns the estimated offset between two clocks at another time, in ns.
-
-        One clock may run slightly faster (drift), so the offset is assumed to grow at the
-        estimated rate.
+        """Extrapolates the estimated offset to another time, in ns, assuming a constant drift.
 
         Args:
-            local_ns: The time on the local clock, in ns.
+            local_ns: Time on the local clock, in ns.
         """
         return self.offset_ns + round((local_ns - self.local_ns) * self.drift / NS_PER_S)
 
     def widen(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
-        """Extends the range of possible offsets, so that it includes further limits.
+        """Extends the range of possible offsets to include additional limits.
 
         Args:
-            *limits: Upper and lower limits of the true offset, from the time stamps of
+            *limits: Upper and lower limits on the true offset, from the time stamps of
                 messages. Limits that are None are ignored.
 
         Returns:
-            A new estimate with the same offset and drift. The range from `low_ns` to `high_ns`
-            includes the values of all given limits.
+            A new estimate with the same offset and drift, whose range from `low_ns` to
+            `high_ns` includes all given limits.
         """
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         low_ns = min([self.low_ns, *offsets])
@@ -124,15 +123,14 @@ class OffsetEstimate(NamedTuple):
         return self._replace(low_ns=low_ns, high_ns=high_ns)
 
     def error_bound_ns(self, local_ns: int, offset_ns: int) -> int:
-        """Returns how far an assumed offset can be from the true offset at a time, in ns.
+        """Returns how far an assumed offset can be from the true offset at a given time, in ns.
 
-        The true offset lies between the limits of this estimate. The limits become wider with
-        the distance from the time of the estimate.
+        The true offset lies between the limits of this estimate, which widen with the distance
+        from the time of the estimate.
 
         Args:
-            local_ns: The time on the local clock, in ns.
-            offset_ns: Assumed offset at that time, the other clock minus the local clock, in
-                ns.
+            local_ns: Time on the local clock, in ns.
+            offset_ns: Assumed offset at that time (other clock minus local clock), in ns.
         """
         passed_s = (local_ns - self.local_ns) / NS_PER_S
         # Before the time of the estimate, a smaller drift gives a larger offset.
@@ -145,12 +143,12 @@ class OffsetEstimate(NamedTuple):
 
     @classmethod
     def exact(cls, offset_ns: int) -> "OffsetEstimate":
-        """Returns the estimate of a constant offset that is known exactly.
+        """Returns the estimate for a constant offset that is known exactly.
 
-        Such an offset exists between two readings of the same clock.
+        Used when two readings come from the same clock.
 
         Args:
-            offset_ns: The offset, the other clock minus the local clock, in ns.
+            offset_ns: The offset (other clock minus local clock), in ns.
         """
         return cls(
             local_ns=0,
@@ -164,28 +162,25 @@ class OffsetEstimate(NamedTuple):
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Writes an offset between two clocks and its error bound as text for the user.
+    """Formats a clock offset and its error bound as a short string with units.
 
     Args:
         offset_ns: The offset, in ns.
         bound_ns: Largest possible error of the offset, in ns.
-
-    Returns:
-        A short text with units, for example for an event or a table.
     """
     return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
 
 
 class OffsetEstimator:
-    """Estimates the offset of another clock from the limits of the latest windows.
+    """Estimates the offset of another clock from the limits of the most recent windows.
 
-    Time stamps of messages are evaluated in windows of time. Each window contributes its lowest
-    upper limit (ceiling) and its highest lower limit (floor).
+    Each time window contributes the lowest upper limit (ceiling) and the highest lower limit
+    (floor) of its messages.
 
     Attributes:
-        broken: Number of times that the limits contradicted each other. The older half of the
-            limits was discarded each time. Such a contradiction shows that a clock has stepped,
-            or has drifted by more than DRIFT_LIMIT.
+        broken: Number of times that the limits contradicted each other and the older half of
+            them was discarded. A contradiction shows that a clock has stepped, or has drifted
+            by more than DRIFT_LIMIT.
     """
 
     def __init__(self) -> None:
@@ -194,16 +189,15 @@ class OffsetEstimator:
         self._floors: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
 
     def add(self, ceiling: OffsetLimit | None, floor: OffsetLimit | None) -> None:
-        """Adds the tightest limits of the offset from one window of time.
+        """Adds the tightest limits on the offset from one time window.
 
-        Each message in the window limits the offset between the clocks. A message from this
-        machine gives an upper limit (ceiling), and a message to this machine a lower limit
-        (floor).
+        A message sent by this machine gives an upper limit (ceiling), and a message received by
+        this machine gives a lower limit (floor).
 
         Args:
             ceiling: Lowest upper limit in the window. None if the other machine acknowledged no
-                message of this machine.
-            floor: Highest lower limit in the window. None if no message of the other machine
+                message from this machine.
+            floor: Highest lower limit in the window. None if no message from the other machine
                 arrived.
         """
         if ceiling is not None:
@@ -212,20 +206,20 @@ class OffsetEstimator:
             self._floors.append(floor)
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
-        """Estimates the offset of the other clock at the present time.
+        """Estimates the present offset of the other clock.
 
         The offset is modelled as a straight line over time, below every stored ceiling and
         above every stored floor. If no such line exists, a clock has stepped, and the older
-        limits belong to the time before the step. The older half of the limits is then
-        discarded, until such a line exists.
+        limits date from before the step. The older half of the limits is then discarded,
+        repeatedly if necessary, until a line exists.
 
         Args:
             now_ns: Present time on the local clock, in ns. It must not be earlier than any of
                 the stored limits.
 
         Returns:
-            The estimate. None if there is no ceiling or no floor, because the offset is then
-            limited on one side at most.
+            The estimate, or None if there is no ceiling or no floor, since the offset is then
+            bounded on one side at most.
         """
         while self._ceilings and self._floors:
             lines = _AdmissibleLines(self._ceilings, self._floors, now_ns)
@@ -241,13 +235,13 @@ class OffsetEstimator:
 
 
 class _AdmissibleLines:
-    """All straight lines of the offset over time below every ceiling and above every floor.
+    """All straight lines for the offset over time below every ceiling and above every floor.
 
-    The ceilings and floors are the limits of the offset that follow from the time stamps. The
-    set of lines is described by its steepest and its flattest line.
+    The ceilings and floors are the limits on the offset derived from the time stamps. The set
+    of lines is described by its steepest and its flattest line.
 
     Times are in s relative to the present, and offsets in ns relative to the latest ceiling.
-    These small numbers keep the precision that floating-point numbers would lose for 64-bit
+    These small values keep the precision that floating-point arithmetic would lose on 64-bit
     times.
 
     Args:
@@ -263,10 +257,10 @@ class _AdmissibleLines:
     def __init__(
         self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int
     ) -> None:
-        """Computes the steepest and the flattest line that the limits of a clock offset permit.
+        """Computes the steepest and the flattest line that the limits on a clock offset allow.
 
-        A line describes how the offset may change over time. Its slope is the drift of the
-        clock.
+        A line describes a possible course of the offset over time. Its slope is the drift of
+        the clock.
         """
         self._now_ns = now_ns
         self._base_ns = ceilings[-1].offset_ns
@@ -292,14 +286,14 @@ class _AdmissibleLines:
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
     def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[_Array, _Array]:
-        """Converts limits of the offset to arrays of small numbers, for precise arithmetic.
+        """Converts limits on the offset to arrays of small numbers, for precise arithmetic.
 
         Args:
             limits: Ceilings or floors.
 
         Returns:
-            The time of each limit in s relative to the present, never above 0; and its offset
-            in ns relative to the latest ceiling.
+            The time of each limit in s relative to the present, which is never positive, and
+            its offset in ns relative to the latest ceiling.
         """
         times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
         offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]
@@ -307,22 +301,22 @@ class _AdmissibleLines:
         return times_s, np.array(offsets_ns, dtype=np.float64)
 
     def estimate(self) -> OffsetEstimate:
-        """Estimates the offset from all straight lines that the time stamps permit.
+        """Estimates the offset from all straight lines consistent with the time stamps.
 
         A line describes the offset between the clocks over time. Let t be the time in s
         relative to the present, so that t <= 0 for all limits. The line
 
             offset(t) = v + slope t
 
-        has the value v at present. It is permitted if it is below every ceiling c at its time
+        has the present value v. It is admissible if it lies below every ceiling c at its time
         t_c, and above every floor f at its time t_f:
 
             f - slope t_f <= v <= c - slope t_c.
 
-        Ceilings and floors are relaxed, moved apart by `WANDER` per second of their age,
-        because the drift is not exactly constant. The most probable slope is computed first.
-        The estimated offset is in the middle of the permitted values v for that slope. The
-        limits of the estimate include all permitted lines.
+        Because the drift is not exactly constant, ceilings and floors are first moved apart by
+        `WANDER` per second of their age. The most probable slope is computed next. The
+        estimated offset is the middle of the admissible values v for that slope. The limits of
+        the estimate cover all admissible lines.
 
         Returns:
             The estimate for the present time.
@@ -349,7 +343,7 @@ class _AdmissibleLines:
         )
 
     def _estimate_slope(self) -> float:
-        """Estimates the drift by weighted least squares, as one slope for ceilings and floors.
+        """Estimates the drift in ns/s by weighted least squares, with one slope for all limits.
 
         The ceilings and the floors have different levels but the same slope,
 
@@ -359,10 +353,10 @@ class _AdmissibleLines:
         its time, t_mean is the weighted mean time of its group, and prior is the standard
         deviation of the drift before any measurement.
 
-        A limit from a slow message contains little information. Therefore its weight falls with
-        its distance from the tightest limit of the group. This distance depends on the slope.
-        Therefore the weights are computed again in each round (iteratively reweighted least
-        squares). In the first round all weights are equal.
+        A limit from a slow message contains little information, so its weight decreases with
+        its distance from the tightest limit of the group. Because this distance depends on the
+        slope, the weights are recomputed in each round (iteratively reweighted least squares).
+        In the first round, all weights are equal.
 
         Returns:
             The drift, in ns/s.
@@ -391,13 +385,13 @@ class _AdmissibleLines:
 
 
 SLEW_NS = 1_000_000_000
-"""Time in which the smoothed offset reaches a new estimate, in ns."""
+"""Time within which the smoothed offset reaches a new estimate, in ns."""
 
 
 class _SlewSegment:
     """Smoothed offset of another clock from one estimate to the next, as two straight lines.
 
-    The first line leads from the previous value of the offset to the estimate, within SLEW_NS.
+    The first line leads from the previous value of the offset to the estimate within SLEW_NS.
     The second line follows the estimate and its drift.
 
     Args:
@@ -412,9 +406,9 @@ class _SlewSegment:
     """
 
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
-        """Computes how the clock offset in use gradually approaches an estimate.
+        """Computes how the smoothed offset gradually approaches an estimate.
 
-        It also computes the largest error of the offset during the approach.
+        The largest error during the transition is computed too.
         """
         self.start_ns = start_ns
         self.estimate = estimate
@@ -429,28 +423,28 @@ class _SlewSegment:
         self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the offset in use at a time: the other clock minus the local clock, in ns.
+        """Returns the smoothed offset (other clock minus local clock) at a given time, in ns.
 
         It approaches its estimate gradually, because a jump would disturb the control loop.
 
         Args:
-            local_ns: The time on the local clock, in ns.
+            local_ns: Time on the local clock, in ns.
         """
         passed_ns = local_ns - self._joined_ns
         rate = self._approach_rate if passed_ns < 0 else self._drift_per_ns
         return self._joined_offset_ns + int(passed_ns * rate)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of the smoothed offset at a time, in ns.
+        """Returns the largest possible error of the smoothed offset at a given time, in ns.
 
-        The error is the difference between the smoothed offset (the other clock minus the local
-        clock) and the true offset. While the smoothed offset still approaches the estimate,
-        until `SLEW_NS` after the start of the segment, the result is `bound_ns`, the largest
-        error in that phase. Afterwards, it is the largest distance of the smoothed offset from
-        the offsets that the estimate permits at that time.
+        The error is the difference between the smoothed offset and the true offset (other clock
+        minus local clock). Until `SLEW_NS` after the start of the segment, while the smoothed
+        offset is still approaching the estimate, the result is `bound_ns`, the largest error in
+        that phase. Afterwards, it is the largest distance of the smoothed offset from any
+        offset that the estimate admits at that time.
 
         Args:
-            local_ns: The time on the local clock, in ns.
+            local_ns: Time on the local clock, in ns.
         """
         is_approaching = self.start_ns <= local_ns <= self._joined_ns
         if is_approaching:
@@ -462,11 +456,10 @@ class _SlewSegment:
 class SlewedOffset:
     """Offset between two clocks (other clock minus local clock) that changes without steps.
 
-    Delays are computed with this offset and not with the latest estimate, because a new
-    estimate would appear as a step of all delays. The smoothed offset instead approaches each
-    estimate along a straight line. Two segments are stored: one for the latest estimate and one
-    for the estimate before it. The offset is therefore defined only from the start of the
-    earlier segment on.
+    Delays are computed with this offset and not with the latest estimate, because each new
+    estimate would appear as a step in all delays. The smoothed offset instead approaches each
+    estimate along a straight line. Two segments are stored, for the latest estimate and the one
+    before it, so the offset is defined only from the start of the earlier segment onwards.
 
     Args:
         estimate: First estimate. The smoothed offset equals it from the beginning.
@@ -481,7 +474,7 @@ class SlewedOffset:
     def estimate(self) -> OffsetEstimate:
         """Latest estimate of the offset between two clocks.
 
-        The offset in use approaches the estimate gradually, because a jump would disturb the
+        The smoothed offset approaches this estimate gradually, because a jump would disturb the
         control loop.
         """
         return self._segment.estimate
@@ -491,17 +484,17 @@ class SlewedOffset:
         """Largest error of the smoothed offset while it approaches the latest estimate, in ns.
 
         Afterwards, the possible error grows with the age of the estimate. `error_bound_ns`
-        returns the error bound at any time.
+        gives the error bound for any time.
         """
         return self._segment.bound_ns
 
     def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
         """Makes the offset approach a new estimate gradually, instead of jumping to it.
 
-        The offset reaches the estimate after the time SLEW_NS, and then follows its drift.
+        The offset reaches the estimate after SLEW_NS, and then follows its drift.
 
         Args:
-            local_ns: Time on the local clock at which the approach begins, in ns.
+            local_ns: Time on the local clock at which the transition begins, in ns.
             estimate: The new estimate.
         """
         segment = _SlewSegment(local_ns, self.evaluate_ns(local_ns), estimate)
@@ -509,29 +502,26 @@ class SlewedOffset:
         self._segment = segment
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the clock offset in use at a time, which changes only gradually, in ns.
+        """Returns the smoothed clock offset at a given time (other minus local clock), in ns.
 
         Args:
-            local_ns: The time on the local clock, in ns. It must not be earlier than the start
-                of the stored segments, at which the offset began to approach the second latest
+            local_ns: Time on the local clock, in ns. It must not be earlier than the start of
+                the earlier stored segment, when the offset began to approach the second latest
                 estimate.
-
-        Returns:
-            The other clock minus the local clock, in ns.
         """
         return self._select_segment(local_ns).evaluate_ns(local_ns)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns how far the clock offset in use can be from the true offset at a time, in ns.
+        """Returns the largest possible error of the smoothed offset at a given time, in ns.
 
         Args:
-            local_ns: The time on the local clock, in ns. It must be a time that `evaluate_ns`
-                accepts.
+            local_ns: Time on the local clock, in ns, subject to the same limit as in
+                `evaluate_ns`.
         """
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 
     def _select_segment(self, local_ns: int) -> _SlewSegment:
-        """Returns the segment of the smoothed offset that holds at a local time.
+        """Returns the segment of the smoothed offset that applies at a local time.
 
         There are two segments: the approach to the latest estimate, and the previous segment
         for earlier times.

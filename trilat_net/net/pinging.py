@@ -1,12 +1,12 @@
-"""Measures the clocks of other processes by pings, and repeats queries over a poor network.
+"""Measures the clocks of other processes with pings, and repeats queries over a poor network.
 
-A ping is a query to which a process replies at once, with the readings of its clock when the
-ping arrived and when the reply was sent. The difference between its clock and the local clock
-is then known to half the round trip, however large the difference is. For example, a round trip
-of 0.4 ms gives the difference to 0.2 ms.
+A ping is a query that a process answers immediately with two readings of its clock: when the
+ping arrived, and when the reply was sent. This determines the difference between its clock and
+the local clock to within half the round trip, however large the difference is. A round trip of
+0.4 ms, for example, gives the difference to within 0.2 ms.
 
-Queries and replies may be lost, or may take longer than the time between two queries. Therefore
-a query is repeated, and replies to the last QUERIES_KEPT copies are accepted.
+Queries and replies may be lost, or may take longer than the interval between two queries.
+Queries are therefore repeated, and replies to the last QUERIES_KEPT copies are accepted.
 """
 
 from collections import deque
@@ -23,19 +23,19 @@ from .requests import Backfill, BackfillRequest, Pong
 from .wire import decode, encode
 
 QUERIES_KEPT = 128
-"""Number of the latest copies of a query whose replies are accepted."""
+"""Number of most recent copies of a query whose replies are accepted."""
 QUERY_PERIOD_NS = 200_000_000
 """Time between two queries for identities, in ns."""
 
 
 class RepeatedQuery:
-    """Sends a query repeatedly, and collects the replies to all of its copies.
+    """Sends a query repeatedly, in case it is lost, and collects the replies to all copies.
 
-    A query may be lost and is therefore sent several times. Each reply is assigned to the copy
-    of the query that it answers, which gives the round trip time.
+    Each reply is matched to the copy of the query that it answers, which gives the round trip
+    time.
 
     Args:
-        bus: Network connection of the member (process of a session) that sends the query.
+        bus: Network connection of the member that sends the query.
         clock: Clock of that member.
         key: Key of the query. Every member that serves a matching key replies.
     """
@@ -47,15 +47,13 @@ class RepeatedQuery:
         self._pending: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
     def repeat(self, period_ns: int = QUERY_PERIOD_NS) -> bool:
-        """Sends the query again if enough time has passed since it was sent last.
+        """Sends the query again if enough time has passed since the last copy.
 
-        A query may be lost, or its receiver may have started later.
+        Returns True if the query was sent. A repetition is needed because a query may be lost,
+        and its receiver may start later.
 
         Args:
-            period_ns: Shortest time between two copies, in ns.
-
-        Returns:
-            True if the query was sent.
+            period_ns: Shortest interval between two copies, in ns.
         """
         now_ns = self._clock.monotonic_ns()
         if self._pending:
@@ -66,10 +64,10 @@ class RepeatedQuery:
         return True
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns the next reply that has arrived for the query, without waiting.
+        """Returns the next reply to the query if one has arrived, without waiting.
 
         Returns:
-            The time at which the query was sent in ns, the key and the payload of the reply.
+            The time at which the query was sent (in ns), the key of the reply and its payload.
             None if no reply has arrived.
         """
         for queried_ns, inbox in self._pending:
@@ -81,22 +79,22 @@ class RepeatedQuery:
 
 
 PINGS = 20
-"""Number of round trips after which the clock of a member counts as known."""
+"""Number of round trips after which the clock of a member is considered known."""
 PINGS_PER_WINDOW = 5
-"""Number of round trips in a window. Of each window, only the most precise limits are used."""
+"""Number of round trips in a window. Only the most precise limits of each window are used."""
 PING_PACE_NS = 10_000_000
-"""Time between two pings until all clocks are known, in ns."""
+"""Interval between pings until all clocks are known, in ns."""
 PING_REST_NS = 250_000_000
-"""Time between two pings when all clocks are known, to keep the estimates up to date, in ns."""
+"""Interval between pings that keep the estimates up to date once clocks are known, in ns."""
 GLANCE_NS = 100_000
-"""Time between two polls while a reply is expected, in ns.
+"""Interval between polls while a reply is expected, in ns.
 
-It is short because the arrival of a reply is measured when it is polled.
+It is short because the arrival time of a reply is taken when the reply is polled.
 """
 _ROUND_TRIPS_KEPT = 10_000
-"""Number of the latest round trips that are kept for statistics."""
+"""Number of most recent round trips that are kept for statistics."""
 _LATE_REPLY_NS = 20_000_000
-"""Margin for the time in which a reply is expected, in ns. Two round trips are added to it."""
+"""Margin of the time within which a reply is expected, in ns. Two round trips are added."""
 
 
 def answer_pings(
@@ -105,11 +103,10 @@ def answer_pings(
     session: str,
     info: Info,
 ) -> None:
-    """Replies to pings in a network thread, until the network connection is closed.
+    """Answers pings in a network thread until the network connection is closed.
 
-    A ping is a query to which a member (process of a session) replies at once with two time
-    stamps (`Pong`). From the replies, the sender computes round trip times and the offset
-    between the clocks.
+    The reply contains two time stamps (`Pong`), from which the sender of the ping computes the
+    round trip time and the offset between the clocks.
 
     Args:
         bus: Network connection of the member.
@@ -119,9 +116,9 @@ def answer_pings(
     """
 
     def answer(_: bytes) -> bytes:
-        """Returns the reply to a ping: the clock's readings on its arrival and at the reply.
+        """Returns the reply to a ping, with clock readings from its arrival and departure.
 
-        The sender subtracts the time between both readings from the measured round trip.
+        The sender subtracts the time between the two readings from the measured round trip.
         """
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()
@@ -143,11 +140,11 @@ def answer_backfill(
     boot: int,
     find: Callable[[BackfillRequest], tuple[int, list[bytes], int]],
 ) -> int:
-    """Sends messages again that were lost on the way to a recorder, at its request.
+    """Resends messages that a recorder has missed, at the recorder's request.
 
     Args:
-        query: The query as it has arrived from the recorder.
-        member: Name of the member (process of a session) that replies.
+        query: The query received from the recorder.
+        member: Name of the member that replies.
         boot: Random number that identifies this start of the member.
         find: Function that looks up the requested messages among those that the member still
             stores. It returns the number of the first message, the payloads of consecutive
@@ -176,18 +173,18 @@ def answer_backfill(
 
 
 class RoundTrips:
-    """Estimates the clock offset of one member from round trips: pings and their replies.
+    """Estimates the clock offset of one member from the round trip times of pings.
 
-    A member is a process that takes part in a session. It replies to a ping at once, with the
-    readings of its clock. `Pinger` creates one object of this class for each start of a member.
+    A member answers a ping immediately with the readings of its clock. `Pinger` creates one
+    object of this class per start of a member.
 
     Args:
-        required: Number of round trips after which the clock offset counts as known. The count
-            starts again when round trips contradict each other.
+        required: Number of round trips after which the clock offset is considered known. The
+            count restarts when round trips contradict each other.
 
     Attributes:
-        rtts_ns: The latest round trip times in ns, without the time that the member took to
-            reply.
+        rtts_ns: The most recent round trip times in ns, excluding the time that the member took
+            to reply.
         shortest_ns: The shortest round trip time in ns. 0 before the first round trip.
         estimator: Estimator of the clock offset, with the limits from all round trips so far.
         latest: Latest estimate of the clock offset. None before the first estimate.
@@ -204,22 +201,20 @@ class RoundTrips:
 
     @property
     def is_known(self) -> bool:
-        """True once the offset between two clocks is known.
-
-        It is known when enough measured round trips of messages agree with each other.
-        """
+        """True once enough round trips agree for the clock offset to be known."""
         return self._agreeing >= self._required
 
     def receive(self, pinged_ns: int, pong: Pong, now_ns: int) -> None:
         """Evaluates the reply to a ping. A reply with impossible times is ignored.
 
-        The offset (member's clock minus local clock) is at most the arrival of the ping minus
-        its sending, and at least the sending of the reply minus its arrival.
+        The offset (member's clock minus local clock) is at most the arrival time of the ping
+        minus its sending time, and at least the sending time of the reply minus its arrival
+        time.
 
         Args:
             pinged_ns: Time at which the ping was sent, on the local clock, in ns.
-            pong: The reply of the member (process of a session), with the times at which the
-                ping arrived and the reply left.
+            pong: The member's reply, with the times at which the ping arrived and the reply was
+                sent.
             now_ns: Time at which the reply arrived, on the local clock, in ns.
         """
         reply_time_ns = pong.left_ns - pong.came_ns
@@ -237,8 +232,8 @@ class RoundTrips:
     def _close_window(self, now_ns: int) -> None:
         """Estimates the offset from the tightest limits of the window, and starts a new one.
 
-        Limits from different times are extrapolated to the present with the last estimate of
-        the drift, and then compared.
+        Limits from different times are extrapolated to the present with the last drift
+        estimate, and then compared.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -246,9 +241,9 @@ class RoundTrips:
         drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def extrapolate_limit(limit: OffsetLimit) -> float:
-            """Returns a limit of the clock offset at the present time, in ns.
+            """Extrapolates a limit on the clock offset to the present time, in ns.
 
-            The limit was measured earlier, and moves with the drift of the clocks.
+            The limit was measured earlier, and shifts with the drift of the clocks.
             """
             return limit.offset_ns - drift_per_ns * (limit.local_ns - now_ns)
 
@@ -266,20 +261,20 @@ class RoundTrips:
 
 
 class Pinger:
-    """Sends pings to the members of a session, and estimates the offsets of their clocks.
+    """Pings the members of a session and estimates the offsets of their clocks.
 
-    The owner calls `poll` regularly.
+    The owner must call `poll` regularly.
 
     Args:
         bus: Network connection of this member.
         clock: Clock of this member.
         session: Name of the session.
-        required: Number of round trips after which the offset of a clock counts as known, if
-            they do not contradict each other.
+        required: Number of round trips after which the offset of a clock is considered known,
+            provided they do not contradict each other.
 
     Attributes:
-        trips: Round trips to each member, by its boot, the random number that identifies the
-            start of the member's process.
+        trips: Mapping from the boot of each member (the random number that identifies the start
+            of its process) to the round trips.
     """
 
     def __init__(
@@ -289,7 +284,7 @@ class Pinger:
         session: str,
         required: int = PINGS,
     ) -> None:
-        """Prepares to measure round trips to other processes, but sends no ping yet."""
+        """Prepares to measure round trips to other processes. No ping is sent yet."""
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
         self._required = required
@@ -298,16 +293,14 @@ class Pinger:
         self._reply_expected_until_ns = 0
 
     def poll(self, boots: Collection[int]) -> None:
-        """Sends a ping to the other members if it is due, and evaluates the replies to pings.
+        """Pings the other members if a ping is due, and evaluates replies received so far.
 
-        A ping is a query to which a member replies with the readings of its clock. The method
-        does not wait for replies. Until the offsets of all clocks are known, pings are sent
-        with the short period `PING_PACE_NS`. Afterwards, the longer period `PING_REST_NS`
-        suffices to keep the estimates up to date.
+        Never waits for replies. Pings are sent with the short period `PING_PACE_NS` until the
+        offsets of all clocks are known. After that, the longer period `PING_REST_NS` is enough
+        to keep the estimates up to date.
 
         Args:
-            boots: Boots of the members whose replies are evaluated. A boot is a number that
-                identifies one start of a process. If there are no boots, no ping is sent.
+            boots: Boots of the members whose replies are evaluated. If empty, no ping is sent.
         """
         period_ns = PING_REST_NS if self.knows_clocks(boots) else PING_PACE_NS
         was_ping_sent = bool(boots) and self._query.repeat(period_ns)
@@ -330,7 +323,7 @@ class Pinger:
                 trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """Returns True if the clock offsets to all of the given processes are known.
+        """Returns True if the clock offsets to all of the given members are known.
 
         Args:
             boots: Boots of these members, the numbers that identify the starts of their
@@ -341,7 +334,7 @@ class Pinger:
     def estimate(self, boot: int) -> OffsetEstimate:
         """Returns the latest estimate of the offset of a member's clock.
 
-        The offset is exactly zero for a member without an estimate, because only members on
+        A member without an estimate has an offset of exactly zero, because only members on
         other machines are pinged.
 
         Args:
@@ -353,32 +346,29 @@ class Pinger:
         return trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
-        """Returns the object that estimates the clock offset of a member.
+        """Returns the estimator of a member's clock offset, or None before its first reply.
 
-        It contains the limits of the offset from all pings to this member so far.
+        The estimator holds the limits on the offset from all pings to this member so far.
 
         Args:
             boot: Boot of the member, the number that identifies the start of its process.
-
-        Returns:
-            The estimator. None if the member has not replied to any ping.
         """
         trips = self.trips.get(boot)
         return None if trips is None else trips.estimator
 
     def slowest_ns(self) -> int:
-        """Returns the largest round trip time to any member, in ns.
+        """Returns the round trip time to the slowest member, in ns; 0 if none was measured.
 
-        The round trip time of a member is the shortest one that was measured, because longer
-        ones contain waiting times. The result is 0 if nothing has been measured yet.
+        The shortest measured round trip of each member is compared, because longer ones include
+        waiting times.
         """
         return max((trips.shortest_ns for trips in self.trips.values()), default=0)
 
     def pause_ns(self, otherwise_ns: int) -> int:
         """Returns how long the caller may wait until the next poll, in ns.
 
-        While replies to pings are expected, the pause is short, so that they are evaluated
-        soon.
+        The pause is short while replies to pings are expected, so that they are evaluated
+        promptly.
 
         Args:
             otherwise_ns: Pause while no reply to a ping is expected, in ns.
@@ -388,17 +378,14 @@ class Pinger:
         return otherwise_ns
 
     def describe_clocks(self, boots: Mapping[str, int], local_ns: int) -> list[str]:
-        """Describes the clocks of the members on other machines, for the user.
+        """Describes the clock of each member on another machine in one sentence, for the user.
 
-        Members on this machine use the same clock and are left out.
+        Members on this machine share its clock and are omitted.
 
         Args:
-            boots: Boot of each member, the number that identifies the start of its process, by
-                name.
+            boots: Mapping from the name of each member to its boot, the number that identifies
+                the start of its process.
             local_ns: Time on the local clock for which the offsets are stated, in ns.
-
-        Returns:
-            One sentence for each member on another machine.
         """
         texts = []
         for name, boot in boots.items():

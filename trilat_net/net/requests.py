@@ -1,17 +1,17 @@
 """Defines the messages that one process sends to one other process of a session.
 
-They are replies to pings, requests for changes, requests for lost messages, measurements of
-real arms, reports of dead-man switches, and the targets of operators (the people or programs
+These are replies to pings, requests for changes, requests for lost messages, measurements of
+real arms, reports from dead-man switches, and the targets of operators (the people or programs
 that move arms). Published messages, which everybody receives, are defined in `messages`.
 
-A log contains only published messages: the state of each arm in each period of its control loop
-(its record), and events. The messages of this module appear in a log by their effects:
+A log contains only published messages: events, and the state of each arm in each tick (its
+record). The messages of this module are visible in a log through their effects:
 
 - A change is logged as an event.
-- A lost message that was sent again is logged like all other messages.
+- A lost message that was sent again is logged like any other message.
 - A measurement is logged as `q` and `qd` (joint angles and velocities) of the record that used
-  it. In each period, an arm uses the newest measurement.
-- A target or force of an operator is logged as `hand` of the records in which it acts.
+  it. In each tick, an arm uses the newest measurement.
+- A target or force of an operator is logged as `hand` in the records in which it acts.
 """
 
 import math
@@ -24,25 +24,25 @@ from ..errors import count_nouns
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
 BACKFILL_MESSAGES = 64
-"""Largest number of messages in one `Backfill`."""
+"""Maximum number of messages in one `Backfill`."""
 BACKFILL_BYTES = 40_000
-"""Largest total size of the messages in one `Backfill`, unless one message alone is larger."""
+"""Maximum total size of the messages in one `Backfill`, unless one message alone is larger."""
 
 
 class DirectMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base class of requests between processes, of replies to them, and of measurements.
+    """Base class of requests between processes, their replies, and measurements.
 
-    Every message contains the version of the schema, so that a process with another version of
-    the program recognises that it cannot read the message.
+    Every message contains the schema version, which allows a process that runs another version
+    of the program to recognise that it cannot read the message.
     """
 
     v: int = VERSION
 
 
 class Pong(DirectMessage, frozen=True, kw_only=True):
-    """Reply of a process to a ping, with two of the four time stamps of a round trip.
+    """Reply to a ping, with two of the four time stamps of a round trip.
 
-    The time stamps serve to measure the offset between two clocks.
+    The time stamps are used to measure the offset between two clocks.
 
     Attributes:
         member: Name of the member.
@@ -61,27 +61,27 @@ class Pong(DirectMessage, frozen=True, kw_only=True):
 
 
 OrderName = Literal["", "stop", "enable", "reset"]
-"""Orders that a site accepts from users. The empty text stands for no order."""
+"""Commands that a site accepts from users. An empty string stands for no command."""
 
 
 class ChangeRequest(DirectMessage, frozen=True, kw_only=True):
-    """Request to an arm controller (site) to change a setting from its next tick on.
+    """Request to a site to change a setting from its next tick onwards.
 
-    A tick is a control period. The changes are those that a scenario can contain in its
-    timeline. A request sets exactly one of `link`, `dominance`, `stop_s`, `mark` and `order`.
+    The possible changes are those that a scenario can contain in its timeline. A request sets
+    exactly one of `link`, `dominance`, `stop_s`, `mark` and `order`.
 
     Attributes:
-        link: Link whose settings change, as in "m1->s".
-        dominance: Site whose weights change, with which it follows its peers.
+        link: Link whose settings change, such as "m1->s".
+        dominance: Site whose weights for following its peers change.
         to: The new settings of the link, or the new weights.
         ramp_s: Duration of the transition to the new weights, in s.
-        stop_s: Time at which the run ends, in s since the epoch, the common start of the
-            session. The last tick of the site is before this time.
-        mark: Text that is stored in the log as a mark of the present moment.
-        order: Order to the site, such as "stop", which it executes in its next tick.
-        source: Who requests the change: a noun phrase such as "the experimenter", which the
-            event of the site repeats. A request without a source has the same bytes as a
-            request from a program that does not know this field.
+        stop_s: Time at which the run ends, in s since the epoch (the common start of the
+            session). The last tick of the site is before this time.
+        mark: Text stored in the log to mark the present moment.
+        order: Command to the site, such as "stop", executed in its next tick.
+        source: The person or program that requests the change: a noun phrase such as "the
+            experimenter", which is repeated in the site's event. A request without a source is
+            encoded as the same bytes as a request from a program that does not know this field.
     """
 
     link: str = ""
@@ -95,15 +95,15 @@ class ChangeRequest(DirectMessage, frozen=True, kw_only=True):
 
 
 class ChangeReply(DirectMessage, frozen=True, kw_only=True):
-    """Reply of an arm controller (site) to a request for a change (`ChangeRequest`).
+    """Reply of a site to a request for a change (`ChangeRequest`).
 
     Attributes:
         member: Name of the site.
         accepted: True if the site applies the change.
         text: Sentence for the user: the tick from which the change takes effect, or the reason
-            why it was refused.
-        tick: First tick, at the tick rate of the site, in which the change is in effect. It is
-            -1 if the change was refused.
+            why it was rejected.
+        tick: First tick (at the tick rate of the site) in which the change is in effect. -1 if
+            the change was rejected.
     """
 
     member: str
@@ -113,10 +113,9 @@ class ChangeReply(DirectMessage, frozen=True, kw_only=True):
 
 
 class BackfillRequest(DirectMessage, frozen=True, kw_only=True):
-    """Request of a recorder to a site to send again messages that were lost on the way.
+    """Request from a recorder to a site to resend messages that were lost.
 
-    A record is the result of one tick of a control loop, and its number is that of the tick.
-    Statistics and events are numbered from 0.
+    The number of a record is that of its tick. Statistics and events are numbered from 0.
 
     Attributes:
         channel: Channel of the messages: records, statistics or events.
@@ -129,16 +128,14 @@ class BackfillRequest(DirectMessage, frozen=True, kw_only=True):
 
 
 class Backfill(DirectMessage, frozen=True, kw_only=True):
-    """Reply to a request for lost messages, with the messages as they were published.
-
-    They are consecutive. The request is a `BackfillRequest`.
+    """Reply to a `BackfillRequest`, with consecutive messages exactly as they were published.
 
     Attributes:
         member: Name of the site.
         boot: Random number that identifies this start of the site.
         channel: Channel of the messages.
-        first: Number of the first message in this reply. It is the requested number, or that of
-            the oldest message that the site still stores.
+        first: Number of the first message in this reply: the requested number, or that of the
+            oldest message that the site still stores.
         payloads: The messages, at most `BACKFILL_MESSAGES`. Empty if the site has not published
             them yet or no longer stores them.
         made: Number of messages that the site has published on this channel.
@@ -153,20 +150,20 @@ class Backfill(DirectMessage, frozen=True, kw_only=True):
 
 
 class ArmMeasurement(DirectMessage, frozen=True, kw_only=True):
-    """One measurement of a real arm, which its driver sends to the controller (site).
+    """One measurement of a real arm, sent by its driver to the site.
 
     Attributes:
         site: Name of the site.
-        boot: Random number that identifies this start of the driver. During a run, a site
-            accepts the measurements of one start only.
+        boot: Random number that identifies this start of the driver. During a run, a site only
+            accepts measurements from a single start.
         n: Number of the measurement since that start, from 0.
         q: Joint angles in rad.
         qd: Joint velocities in rad/s.
         sent_ns: Time of sending on the driver's monotonic clock, or time of the measurement on
             the arm's clock, in ns. It is not compared with any other clock.
-        tau_x: Torque of the operator and the environment on each joint, in N m. As in records,
-            the torque that acts ON the arm is the negative of this value. Empty if the arm does
-            not measure it.
+        tau_x: Torque exerted by the operator and the environment on each joint, in N m. As in
+            records, the torque that acts ON the arm is the negative of this value. Empty if the
+            arm does not measure it.
     """
 
     site: str
@@ -187,16 +184,16 @@ class ArmMeasurement(DirectMessage, frozen=True, kw_only=True):
 
 
 class ArmEnable(DirectMessage, frozen=True, kw_only=True):
-    """Report on whether somebody holds the dead-man switch of an external arm.
+    """Reports whether the dead-man switch of an external arm is held.
 
-    The program of the switch sends it at least ten times a second.
+    The program of the switch sends it at least ten times per second.
 
     Attributes:
         site: Name of the site.
         boot: Random number that identifies this start of the switch's program.
         n: Number of the message since that start, from 0.
-        held: True while somebody holds the switch. False stops the arm at once. If messages
-            stop arriving, the site stops the arm only after some time of silence.
+        held: True while the switch is held. False stops the arm at once. If messages stop
+            arriving, the site only stops the arm after a certain time.
         sent_ns: Time of sending on the program's monotonic clock, in ns.
     """
 
@@ -208,21 +205,21 @@ class ArmEnable(DirectMessage, frozen=True, kw_only=True):
 
 
 class HandMessage(DirectMessage, frozen=True, kw_only=True):
-    """Target or force with which an operator, a person or a program, moves an arm.
+    """Target or force with which an operator (a person or a program) moves an arm.
 
-    The message is sent when the target or force changes, and repeated within `SILENCE_NS`, so
-    that the site knows that the operator's program still runs.
+    The message is sent when the target or force changes. It is also repeated within
+    `SILENCE_NS`, which shows the site that the operator's program is still running.
 
     Attributes:
         site: Name of the site of the arm.
-        boot: Random number above 0 that identifies the operator. Only one operator at a time
-            moves an arm.
-        source: Name of the person or program, for the users of the session.
+        boot: Random number above 0 that identifies the operator. Only one operator can move an
+            arm at a time.
+        source: Name of the person or program, as shown to the users of the session.
         n: Number of the target or force, from 0. A repeated number means that nothing has
             changed.
         grip: True while the operator moves the arm, and False to release it.
-        target: Target position of the end effector in m, or of the joints in rad. Empty for an
-            operator who pushes.
+        target: Target position of the end effector in m, or target angles of the joints in rad.
+            Empty for an operator who pushes.
         force: Force ON the end effector in N. Empty for all other operators.
         sent_ns: Time of sending on the program's monotonic clock, in ns.
     """
@@ -253,11 +250,10 @@ class PeerSeen(DirectMessage, frozen=True, kw_only=True):
 
 
 class HandViewMessage(DirectMessage, frozen=True, kw_only=True):
-    """State of a site in one control period, for the program that acts as its operator.
+    """State of a site in one tick, for the program that acts as its operator.
 
-    The operator program of the user runs in another process, and decides how the arm of the
-    site moves. It receives the fields except `site` and `boot` as a `HandView`, which explains
-    them. A site is a process that runs one arm.
+    The operator's program runs in a separate process and decides how the arm moves. It receives
+    all fields except `site` and `boot` as a `HandView`, where they are explained.
 
     Attributes:
         site: Name of the site whose arm the operator moves.

@@ -1,11 +1,12 @@
 """Names the settings in which the scenarios of two members of a session differ.
 
-A session starts only if all of its members (processes) have the same scenario. Their identities
-contain its text, so an error message can say which setting was forgotten on one machine.
+A session starts only if all of its members have the same scenario. Each member's identity
+contains the text of its scenario, so an error message can say which setting was forgotten on
+one machine.
 
 Invariant:
     - The text of another member may come from any program on the network. Whatever it contains,
-      the result is one short line without control characters.
+      the result is one short line with no control characters.
 """
 
 import hashlib
@@ -17,11 +18,11 @@ from ..errors import ScenarioError, count_nouns
 from ..toml_text import parse_toml
 
 LISTED_SETTINGS = 3
-"""Number of settings whose values are stated. The others are counted."""
+"""Maximum number of settings whose values are stated. The rest are only counted."""
 _VALUE_LENGTH = 40
-"""Longest text of a value, in characters."""
+"""Maximum length of a value, in characters."""
 _NAME_LENGTH = 80
-"""Longest name of a setting, in characters."""
+"""Maximum length of the name of a setting, in characters."""
 _ABSENT = "absent"
 _DESCRIPTIONS = ("title", "about", "assumed")
 """Settings that have no effect. They are named last."""
@@ -32,7 +33,7 @@ def describe_scenario_difference(
 ) -> str:
     """Returns a phrase that names the settings in which two scenarios differ.
 
-    An example is "link.delay_ms is 150.0 at s and 100.0 at m1".
+    For example: "link.delay_ms is 150.0 at s and 100.0 at m1".
 
     Args:
         first_text: Text of the first member's scenario, in TOML.
@@ -41,7 +42,7 @@ def describe_scenario_difference(
         second_member: Name of the second member.
 
     Returns:
-        The phrase. Empty if a text cannot be read, or if no setting differs.
+        The phrase, or an empty string if a text cannot be read or no setting differs.
     """
     first = _read_settings(first_text)
     second = _read_settings(second_text)
@@ -65,13 +66,13 @@ def describe_scenario_difference(
 
 
 def _read_settings(text: str) -> dict[str, str] | None:
-    """Returns the settings of a scenario by their dotted names, with their values as JSON.
+    """Returns the settings of a scenario: a mapping from dotted name to value as JSON.
 
     Args:
         text: The scenario, in TOML.
 
     Returns:
-        The settings. None if the text is not TOML, or is nested too deeply.
+        None if the text is not TOML, or is nested too deeply.
     """
     try:
         return dict(_list_settings(parse_toml(text)))
@@ -80,7 +81,7 @@ def _read_settings(text: str) -> dict[str, str] | None:
 
 
 def _list_settings(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yields the dotted name and the value of each setting of a table and of its subtables."""
+    """Yields the dotted name and the value of each setting in a table and its subtables."""
     for key, value in table.items():
         name = prefix + _bound_key(key)
         if isinstance(value, dict):
@@ -90,10 +91,10 @@ def _list_settings(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[st
 
 
 def _bound_key(key: str) -> str:
-    """Returns a key, or a short text that stands for a long key and for no other key.
+    """Returns a key, or a short unique string in place of a long key.
 
-    The name of a table is part of the names of all its settings. With a long name, these would
-    need far more memory than the scenario.
+    The name of a table is part of the names of all its settings. If it is long, these would
+    need far more memory than the scenario itself.
     """
     if len(key) <= _NAME_LENGTH:
         return key
@@ -102,7 +103,7 @@ def _bound_key(key: str) -> str:
 
 
 def _shorten(text: str, length: int = _VALUE_LENGTH) -> str:
-    """Returns a text without control characters, cut to a number of characters."""
+    """Removes control characters from a string, and cuts it to a maximum length."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     if len(printable) <= length:
         return printable

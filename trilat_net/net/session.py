@@ -1,31 +1,30 @@
 """Starts a session: its processes find each other and agree on a common start time.
 
-The processes are called members: sites, which each run one arm and its control loop, and
-recorders. The first site of the scenario is the leader. A normal start has three steps, each of
-which is an event that a member publishes:
+The members of the session are sites, each of which runs one arm and its control loop, and
+recorders. The first site of the scenario is the leader. A normal start has three steps, each
+announced by an event that a member publishes:
 
-1. `epoch`: Once all members are known, the leader proposes an epoch, the time of the first
-   period (tick 0) of all control loops, about half a second ahead. The event also lists the
-   members.
+1. `epoch`: Once all members are known, the leader proposes an epoch about half a second ahead.
+   The epoch is the time of tick 0 of all control loops. The event also lists the members.
 2. `ready`: Each member agrees.
 3. `start`: If all members have agreed in time, the leader confirms the epoch. Otherwise it
    proposes another one.
 
-A member may also join a session that is already running. A recorder only reads the epoch from
-the running sites. A site first asks for permission: it publishes the event `coming`, which
+A member may also join a session that is already running. A recorder simply reads the epoch from
+the running sites. A site first asks for permission by publishing the event `coming`, which
 states its first tick. It joins if every running site replies with the event `admit` before that
 tick. If an earlier process of the same site exists, the running sites wait until it has
 disappeared.
 
-The epoch is a time on the leader's monotonic clock. A member on another machine converts it to
-its own clock. It measures the offset between the clocks by pings, with an error of at most half
-a round trip, and is ready only when it knows all clocks that it needs.
+The epoch is a time on the leader's monotonic clock, which members on other machines convert to
+their own clocks. They measure the offset between the clocks with pings, to within half a round
+trip, and are ready only when they know all the clocks they need.
 
 Invariant:
-    - The members agree on one epoch, in whatever order they were started.
-    - No member starts without the event `start`. A member that joins late does not start
-      without a running site.
-    - The time of day decides nothing, because the time of day of two machines may differ.
+    - The members agree on a single epoch, whatever the order in which they were started.
+    - No member starts without the event `start`, and no member joins late without a running
+      site.
+    - No decision depends on the time of day, which may differ between machines.
     - No method waits. The caller polls `SessionJoin` until the epoch is known.
 """
 
@@ -48,22 +47,21 @@ from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
 EPOCH_AHEAD_NS = 500_000_000
-"""Time from the proposal of an epoch to the epoch, in ns. Two round trips are added to it."""
+"""Time from the proposal of an epoch to the epoch, in ns. Two round trips are added."""
 DECIDE_NS = 150_000_000
-"""Time before the epoch by which all members must agree, in ns. A round trip is added to it."""
+"""Time before the epoch by which all members must have agreed, in ns. A round trip is added."""
 LATE_GATHER_NS = 1_500_000_000
-"""Time that a member waits to learn further sites of a running session, in ns."""
+"""Time that a member waits for further sites of a running session to appear, in ns."""
 
 
 class SessionJoin:
-    """Makes one process join a session, and finds the epoch, the common time of tick 0.
+    """Joins a session on behalf of one process, and determines the epoch (the time of tick 0).
 
-    The process first declares its subscriptions, because the other members may send messages to
-    it as soon as they know it. It then creates this object, which announces the process, and
-    calls `poll` regularly until the epoch is returned.
+    The process must declare its subscriptions before it creates this object, because the object
+    announces the process and other members may send messages immediately. The process then
+    calls `poll` regularly until it returns the epoch.
 
-    The first site (arm controller) of the scenario is the leader, which decides when the
-    session starts.
+    The first site of the scenario is the leader, which decides when the session starts.
 
     Args:
         bus: Network connection of this member.
@@ -71,11 +69,10 @@ class SessionJoin:
         session: Name of the session.
         publisher: Publishes the events of this member.
         sites: Names of the scenario's sites. The first one is the leader. Empty for a recorder.
-        late: Rules about sites that join while the session runs.
+        late: Rules for sites that join while the session is running.
 
     Attributes:
-        refusal: Reason why a running site has refused this site. Empty if no site has refused
-            it.
+        refusal: Reason why a running site has rejected this site. Empty if no site has done so.
         membership: The other members of the session.
         pinger: Measures the offsets of the other members' clocks.
     """
@@ -89,7 +86,7 @@ class SessionJoin:
         sites: Sequence[str],
         late: LateSites = LateSites(),  # noqa: B008
     ) -> None:
-        """Announces this process to the other processes of a session, and looks for them."""
+        """Announces this process to the members of a session, and starts to look for them."""
         self._clock = clock
         self._session = session
         self._publisher = publisher
@@ -127,10 +124,10 @@ class SessionJoin:
 
     @property
     def reason(self) -> str:
-        """Why this site could not join a running session, as text for an error message.
+        """Explains why this site could not join a running session, for an error message.
 
-        The reason is the text with which a running site (arm controller) has refused it, or the
-        names of the running sites that have not admitted it. Empty if the reason is not known.
+        This is either the message with which a running site has rejected it, or the names of
+        the running sites that have not admitted it. Empty if the reason is not known.
         """
         running = {info.member for info in self.membership.list_running()}
         silent_sites = sorted(running - self._admitted_by)
@@ -144,10 +141,10 @@ class SessionJoin:
 
     @property
     def announced_first_tick(self) -> int:
-        """First control period (tick) of this site, as it requested to join a running session.
+        """First tick that this site announced when it asked to join a running session.
 
-        The site executes its control loop from this tick on. It is 0 if the site has not
-        requested to join.
+        The site executes its control loop from this tick onwards. 0 if the site has not asked
+        to join.
         """
         if self._coming is None:
             return 0
@@ -156,23 +153,23 @@ class SessionJoin:
 
     @property
     def _info(self) -> Info:
-        """Identity of this member, as others receive it: its boot, scenario and clock."""
+        """Identity of this member as seen by others, with its boot, scenario and clock."""
         return self._publisher.info
 
     def poll(self) -> Epoch | None:
-        """Receives messages, replies to them, and takes the next step towards the start.
+        """Receives and answers messages, and takes the next step towards the start.
 
-        If the session runs already and this member may join late, it joins the session. A
-        recorder always may, because it only receives. Otherwise the leader, the first site of
-        the scenario, proposes and confirms the epoch, the common start time. The other members
-        agree to the proposal, and wait for the confirmation.
+        If the session is already running and this member may join late, it joins. (A recorder
+        always may, since it only receives.) Otherwise the leader, which is the first site of
+        the scenario, proposes and confirms the epoch, and the other members agree to the
+        proposal and wait for the confirmation.
 
-        A member that has agreed to a proposal may find other members running because they have
-        received the confirmation earlier. It waits for the confirmation as well, until the
-        proposed epoch has passed. Only then does it join late.
+        A member that has agreed to a proposal may see others already running because they
+        received the confirmation earlier. It still waits for the confirmation until the
+        proposed epoch has passed, and joins late only after that.
 
         Returns:
-            The epoch once it is fixed. None until then.
+            The epoch once it is fixed, and None until then.
 
         Raises:
             SessionError: This member cannot be part of the session.
@@ -205,23 +202,23 @@ class SessionJoin:
         return epoch
 
     def _join_late(self, running: Sequence[Info], now_ns: int) -> Epoch | None:
-        """Takes the next step to join a session that is running already.
+        """Takes the next step to join a session that is already running.
 
-        These steps must be completed one after another:
+        The following steps must be completed in order:
 
         1. All sites of the session that are present are known, or `LATE_GATHER_NS` have passed.
         2. A site (not a recorder) knows the clocks of all running sites on other machines.
-        3. One running site is selected, whose epoch (time of tick 0) is used. Its clock is
-           known, so that the epoch can be converted to the local clock.
+        3. One running site is selected as the source of the epoch (the time of tick 0). Its
+           clock is known, so that the epoch can be converted to the local clock.
         4. A site requests admission, and all running sites grant it. A recorder needs no
-           admission and may record at once.
+           admission and may start recording at once.
 
         Args:
             running: Identities of the running sites.
             now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The epoch of the session once this member may take part. None until then.
+            The epoch of the session once this member may take part, and None until then.
         """
         if self._found_running_ns is None:
             self._found_running_ns = now_ns
@@ -254,10 +251,10 @@ class SessionJoin:
         return self._request_admission(local_epoch, running, now_ns)
 
     def _awaits_sites(self, running: Sequence[Info]) -> bool:
-        """Returns True if further sites of the running session are expected to reply.
+        """Returns True if more sites of the running session are expected to reply.
 
-        The running sites (arm controllers) state the members (processes of a session) of the
-        session. Those that have disappeared or were started again are not expected to reply.
+        The running sites list the members of the session. Members that have disappeared or were
+        restarted are not expected to reply.
 
         Args:
             running: Identities of the running sites that have replied.
@@ -273,19 +270,20 @@ class SessionJoin:
         return known_sites < expected_sites  # a proper subset
 
     def _select_epoch_source(self, running: Sequence[Info]) -> Info | None:
-        """Selects the running site (arm controller) from which this member takes the epoch.
+        """Selects the running site from which this member takes the epoch.
 
-        A site on this machine is best, because its epoch needs no conversion between clocks.
-        The next best is the first site of the scenario, whose schedule the others follow.
+        A site on this machine is the best choice, because its epoch needs no conversion between
+        clocks. The next best is the first site of the scenario, whose schedule the others
+        follow.
 
         Returns:
-            The identity of the site. None if the clock of no running site is known yet.
+            The identity of the site, or None if the clock of no running site is known yet.
         """
         local_clock = self._info.clock
         indices = {name: index for index, name in enumerate(self._sites)}
 
         def rank(info: Info) -> tuple[bool, int]:
-            """Returns a sort key: sites on this machine first, then the order of the scenario.
+            """Returns a sort key: sites on this machine first, then in scenario order.
 
             A site on this machine has the same clock, so its start time needs no conversion.
             """
@@ -301,8 +299,9 @@ class SessionJoin:
     ) -> Epoch | None:
         """Requests admission to the running session, and checks if all running sites grant it.
 
-        The request is the event `coming` with a first tick about half a second ahead. If a site
-        has not replied shortly before that tick, another request with a later tick follows.
+        The request is the event `coming`, with a first tick about half a second ahead. If a
+        site has not replied shortly before that tick, the request is repeated with a later
+        tick.
 
         Args:
             epoch: The epoch of the session on the clock of this site.
@@ -310,8 +309,8 @@ class SessionJoin:
             now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The epoch and the first tick once all running sites have admitted this site. None
-            until then.
+            The epoch and the first tick once all running sites have admitted this site, and
+            None until then.
         """
         info = self._info
         rate_hz = self._late.rate_hz
@@ -350,16 +349,15 @@ class SessionJoin:
         """Returns the start time and the members of a running session that this site joins.
 
         Args:
-            coming: Request of this site (event `coming`) that all running sites (arm
-                controllers) have granted. It states the first tick (control period) of this
-                site.
+            coming: Request of this site (event `coming`) that all running sites have granted.
+                It states the first tick of this site.
             epoch: Start of the session on the clock of this site.
             running: Identities of the running sites.
 
         Returns:
-            The given epoch, to which these are added: the boot of each member, which identifies
-            the start of its process; the time of tick 0 on the clock of each running site and
-            of this site, in ns; the first tick of this site; and its request.
+            The given epoch, extended by the boot of each member (which identifies the start of
+            its process), the time of tick 0 on the clocks of the running sites and of this site
+            in ns, the first tick of this site, and its request.
         """
         info = self._info
         # Later entries replace earlier ones: the members at the start of the session, those
@@ -375,14 +373,12 @@ class SessionJoin:
     def _list_other_clocks(
         self, boots: Mapping[str, int], clocks: Mapping[str, str]
     ) -> set[int]:
-        """Lists the sites on other machines, whose clock offsets must be measured.
+        """Returns the boots of sites on other machines, whose clock offsets are needed.
 
         Args:
-            boots: Number that identifies the start of each member's process, by name.
-            clocks: Identity of each member's clock, by name.
-
-        Returns:
-            The boots of these sites (arm controllers).
+            boots: Mapping from the name of each member to the number that identifies the start
+                of its process.
+            clocks: Mapping from the name of each member to the identity of its clock.
         """
         return {
             boot
@@ -393,22 +389,22 @@ class SessionJoin:
     def _read_events(self) -> Epoch | None:
         """Receives the events of all members, and acts on those about the start.
 
-        The members agree on the epoch, the common time of tick 0, in three steps:
+        The members agree on the epoch (the common time of tick 0) in three steps:
 
         1. `epoch`: The leader proposes an epoch. The event states the number of the proposal
            (`attempt`), and the boots of all members. A boot is a random number that identifies
            one start of a process.
-        2. `ready`: Each member agrees. It states the epoch on its own clock.
+        2. `ready`: Each member agrees, and states the epoch on its own clock.
         3. `start`: The leader confirms the proposal, and states the epochs of all members.
 
         The events `ready` and `start` repeat the number and the boots of their proposal. They
-        are ignored if this member has agreed to another proposal.
+        are ignored if this member has agreed to a different proposal.
 
-        Other events, by which a site is admitted to a session that is running already, are
-        passed to `_receive_admission`.
+        Events about the admission of a site to a running session are passed to
+        `_receive_admission`.
 
         Returns:
-            The epoch once the leader has confirmed the proposal that this member agreed to.
+            The epoch once the leader has confirmed the proposal that this member agreed to, and
             None until then.
         """
         for event in read_messages(self._events, Event):
@@ -437,18 +433,18 @@ class SessionJoin:
         return None
 
     def _receive_admission(self, event: Event) -> None:
-        """Stores whether a running site admits this site, refuses it, or admits another site.
+        """Stores whether a running site admits this site, rejects it, or admits another site.
 
-        A site (arm controller) that wants to join the running session publishes the request
-        `coming`. Each running site replies with the event `admit` or `refused`. The event
-        states which site it is about, the boot of that site (the number that identifies the
-        start of its process), and the number of the request, because a request may be repeated.
+        A site that wants to join the running session publishes the request `coming`. Each
+        running site replies with the event `admit` or `refused`. The event states which site it
+        is about, the boot of that site (the number that identifies the start of its process),
+        and the number of the request, because a request may be repeated.
 
-        Other sites may be admitted while this site waits. Their boots are always noted, because
-        they become members of the session.
+        Other sites may be admitted while this site is waiting. Their boots are always stored,
+        because they become members of the session.
 
         Args:
-            event: An event of a running site. Events of other kinds are ignored.
+            event: An event from a running site. Events of other kinds are ignored.
         """
         joining_site = event.about
         if event.kind == "admit" and joining_site in event.boots:
@@ -472,12 +468,12 @@ class SessionJoin:
 
         The proposal lists the members of the session with their boots, the numbers that
         identify the starts of their processes. This member is included if its name and its boot
-        are listed. If another boot is listed under its name, another process acts as the same
-        member.
+        are listed. If another boot is listed under its name, another process is acting as the
+        same member.
 
-        Proposals of sites other than the leader are ignored. A recorder does not know the
-        leader. It learns the scenario from the identities of the sites, and ignores proposals
-        until one of the listed sites has sent it.
+        Proposals from sites other than the leader are ignored. A recorder does not know the
+        leader, because it obtains the scenario from the identities of the sites. It ignores
+        proposals until it has received the scenario from one of the listed sites.
 
         The member agrees (`_reply_ready`) as soon as it has measured the clocks of the others.
 
@@ -514,8 +510,8 @@ class SessionJoin:
     def _must_wait_for_other_leader(self, event: Event) -> bool:
         """Returns True if this member has agreed to a proposal that may still be confirmed.
 
-        If the leader was started twice, or was restarted, proposals of two processes arrive.
-        A member that has agreed to one of them must not agree to the other, until the epoch of
+        If the leader was started twice, or was restarted, proposals from two processes arrive.
+        A member that has agreed to one of them must not agree to the other until the epoch of
         the first has passed or its process has disappeared.
 
         Args:
@@ -531,9 +527,9 @@ class SessionJoin:
     def _reply_ready(self) -> None:
         """Agrees to the leader's proposal of an epoch once this member has measured all clocks.
 
-        Without a waiting proposal, or while the offset of a clock is still unknown, nothing
-        happens, and the caller tries again later. The reply, the event `ready`, states the
-        proposed epoch on the clock of this member (process of a session).
+        If there is no pending proposal, or the offset of a clock is still unknown, nothing
+        happens, and the caller tries again later. The reply (the event `ready`) states the
+        proposed epoch on the clock of this member.
         """
         proposal = self._waiting_proposal
         if proposal is None:
@@ -564,15 +560,15 @@ class SessionJoin:
     def _lead(self) -> Epoch | None:
         """Takes the next step of the leader: proposes an epoch, or confirms or withdraws it.
 
-        An epoch is proposed once all members are present and their clocks are known. It is
+        An epoch is proposed once all members are present and their clocks are known, and
         confirmed once all members have agreed. It is withdrawn if a member is too late, has
         disappeared, or has joined in the meantime. The next call then proposes another one.
 
         The decision must be made early enough for the confirmation to reach all members before
-        the epoch: earlier than the epoch by `DECIDE_NS` plus the slowest round trip.
+        the epoch, at least `DECIDE_NS` plus the slowest round trip in advance.
 
         Returns:
-            The epoch once it is confirmed. None until then.
+            The epoch once it is confirmed, and None until then.
         """
         now_ns = self._clock.monotonic_ns()
         membership = self.membership
@@ -607,7 +603,7 @@ class SessionJoin:
         return self._make_epoch(start)
 
     def _announce(self, now_ns: int) -> None:
-        """Proposes a common start time (epoch) to all processes, as the leader of the session.
+        """Proposes a common start time (epoch) to all members, as the leader of the session.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -630,11 +626,10 @@ class SessionJoin:
         )
 
     def _make_epoch(self, start: Event) -> Epoch:
-        """Returns the common start time (epoch) of the session, which its leader has confirmed.
+        """Returns the common start time (epoch) of the session, as confirmed by its leader.
 
         Args:
-            start: The leader's event `start`, which states the members (processes of a session)
-                and their epochs.
+            start: The leader's event `start`, which states the members and their epochs.
         """
         assert self._agreed_proposal is not None
         return Epoch(

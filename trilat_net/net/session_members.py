@@ -1,14 +1,13 @@
 """Queries the members of a session, and sends requests to its sites.
 
-A member is a process that takes part in a session. A site is the process of one arm. Members
-use this module to find each other, and programs outside the session, such as the commands that
-stop arms or change network delays, use it to reach the members.
+Members use this module to find each other. Programs outside the session, such as the commands
+that stop arms or change network delays, use it to reach the members.
 
 Invariant:
     - A change is requested only once, because a second request might apply it twice. The caller
-      receives either a reply, or an error that names the arm that did not reply.
-    - A log is not played back under the name of a session that is running, because programs
-      could not distinguish the messages of the log from those of the session.
+      receives either a reply or an error that names the arm that did not reply.
+    - A log is never played back under the name of a running session, because programs could not
+      tell the messages of the log from those of the session.
 """
 
 import math
@@ -39,26 +38,24 @@ POLL_NS = 5_000_000
 REPLY_TIMEOUT_S = 3.0
 """Longest wait for a reply, in s."""
 _NAME_CHECK_S = 0.7
-"""Time for which a playback looks for sites of a session with the same name, in s.
+"""Time for which a playback searches for sites of a session with the same name, in s.
 
 Sites try to connect every half second.
 """
 
 
 class SessionMembers:
-    """The members of a running session, which are queried over an open connection.
-
-    A member is a process of the session, for example a site (arm controller).
+    """Queries the members of a running session over an open connection.
 
     Args:
-        bus: Network connection that reaches the session.
+        bus: Network connection through which the session can be reached.
         clock: Clock of the caller.
         session: Name of the session.
         member: Name of the member whose identity is queried. "*" queries all members.
 
     Attributes:
-        unreadable: Reasons why replies cannot be decoded, by the name of the member that sent
-            the reply.
+        unreadable: Reasons why replies could not be decoded, keyed by the name of the member
+            that sent the reply.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, member: str = "*") -> None:
@@ -71,8 +68,8 @@ class SessionMembers:
     def poll(self) -> Iterator[Info]:
         """Yields the identities that have arrived, and repeats the query if it is due.
 
-        A query may be lost, and members may start at any time. Therefore the query is repeated
-        as long as the owner of this object calls this method.
+        A query may be lost, and members may start at any time, so the query is repeated for as
+        long as this method is called.
 
         A reply is skipped if it cannot be decoded, or if the name in the identity differs from
         the name in the key under which the reply arrived.
@@ -99,18 +96,18 @@ class SessionMembers:
     ) -> Iterator[Info]:
         """Queries the members of a session, and yields their identities as they arrive.
 
-        The query is repeated until the search ends, because a reply may be lost. The identity
-        of a member (process of a session) is therefore yielded repeatedly.
+        The query is repeated until the search ends, because a reply may be lost. The same
+        identity is therefore yielded repeatedly.
 
         Args:
             stopped: Function that returns True to end the search.
             timeout_s: Duration of the search, in s. If None, there is no limit.
 
         Yields:
-            The identity of a member, as soon as a reply has arrived.
+            The identity of a member, as soon as its reply arrives.
 
         Raises:
-            SessionError: The time is over, and none of the replies that arrived could be
+            SessionError: The time has run out, and none of the replies received could be
                 decoded.
         """
         has_readable_reply = False
@@ -132,15 +129,15 @@ class SessionMembers:
     ) -> ChangeReply:
         """Sends a request to a site of a running session, and waits for the reply.
 
-        If the members of the session have keys, changes can be requested only with the keys of
-        the operator. Every member may send the order to stop.
+        If the members of the session have keys, only the operator's keys allow changes. The
+        command to stop is accepted from every member.
 
         Args:
             site: Name of the site.
-            request: The requested change, or an order such as "stop".
+            request: The requested change, or a command such as "stop".
 
         Returns:
-            The reply of the site, accepted or refused.
+            The reply of the site, which either accepts or rejects the request.
 
         Raises:
             SessionError: The site does not reply.
@@ -171,8 +168,8 @@ class SessionMembers:
     ) -> Iterator[Event]:
         """Queries a site for the events that it has published, and yields them in order.
 
-        The first event is the oldest one that the site (arm controller) still stores. The
-        iteration ends early if the site does not reply.
+        The first event is the oldest one that the site still stores. The iteration ends early
+        if the site does not reply.
 
         Args:
             site: Name of the site.
@@ -196,13 +193,13 @@ class SessionMembers:
                 published = backfill.made
 
     def require_absent(self, stopped: Callable[[], bool]) -> None:
-        """Checks that no member is present, before the session's name is used for a playback.
+        """Raises SessionError if a member is present under the session name of a playback.
 
         Args:
             stopped: Function that returns True to end the check early.
 
         Raises:
-            SessionError: A site (arm controller) of the session replies.
+            SessionError: A site of the session replies.
         """
         for info in self.find(stopped=stopped, timeout_s=_NAME_CHECK_S):
             if info.member == topics.RECORDER:
@@ -227,7 +224,7 @@ class SessionMembers:
             request: The request.
 
         Returns:
-            The payload of the reply. None if no reply arrives within `REPLY_TIMEOUT_S`.
+            The payload of the reply, or None if no reply arrives within `REPLY_TIMEOUT_S`.
         """
         replies = self._bus.query(key, encode(request))
         deadline_ns = self._clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)

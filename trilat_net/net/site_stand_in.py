@@ -1,12 +1,11 @@
-"""Presents a site to the other members of a session when its process is not there.
+"""Stands in for a site whose process is absent, as seen by the other members of a session.
 
-A site is the process that runs one arm. When a log is played, the recorded messages are
-published again, but the site itself is absent. To the other members, a `SiteStandIn` looks like
-the site.
+When a log is played back, the recorded messages are published again, but the sites themselves
+are not running. To the other members, a `SiteStandIn` looks like the site.
 
 Invariant:
-    - The other members see a presence token, an identity, and replies to pings and to requests
-      for past messages, as from the site itself.
+    - The other members see a liveliness token, an identity, and replies to pings and to
+      requests for past messages, as if they came from the site itself.
 """
 
 from collections.abc import Callable
@@ -22,17 +21,17 @@ from .requests import BackfillRequest
 from .wire import encode
 
 REFRESH_NS = 500_000_000
-"""Time for which an encoded identity is used again, in ns.
+"""Time for which an encoded identity is reused, in ns.
 
-An identity contains a whole scenario, so that its encoding takes long.
+Encoding takes long, because an identity contains a complete scenario.
 """
 
 
 class SiteStandIn:
-    """Announces a site in a session, and answers other members in the name of the site.
+    """Announces a site in a session, and answers other members on behalf of the site.
 
     Args:
-        bus: Network connection of the process that takes the place of the site.
+        bus: Network connection of the process that stands in for the site.
         clock: Clock of that process.
         session: Name of the session.
         site: Name of the site.
@@ -67,12 +66,13 @@ class SiteStandIn:
     def start_session(
         self, epoch_mono_ns: int, epoch_unix_ns: int, boots: dict[str, int]
     ) -> None:
-        """Announces the session as running, so that other members join it.
+        """Announces the session as running, which makes other members join it.
 
         Args:
             epoch_mono_ns: Start time of the session (tick 0) on the monotonic clock, in ns.
             epoch_unix_ns: The same time as Unix time, in ns.
-            boots: For each site, the random number that identifies the start of its process.
+            boots: Mapping from site to the random number that identifies the start of its
+                process.
         """
         self._info = msgspec.structs.replace(
             self._info,
@@ -84,7 +84,7 @@ class SiteStandIn:
         self._encoded = (0, b"")
 
     def answer_identity_queries(self, count_ticks: Callable[[], int]) -> None:
-        """Answers all waiting queries for the identity of the site.
+        """Answers all pending queries for the identity of the site.
 
         Args:
             count_ticks: Function that returns how many ticks of the site have passed. It is
@@ -107,27 +107,27 @@ class SiteStandIn:
         find_boot: Callable[[], int],
         find_messages: Callable[[str, int, int], tuple[int, list[bytes], int]],
     ) -> int | None:
-        """Answers the oldest request of a recorder for messages that it has missed.
+        """Answers the oldest request from a recorder for messages that it has missed.
 
-        The recorder accepts only replies of the start of the site that it follows.
+        The recorder only accepts replies from the start of the site that it is following.
 
         Args:
             find_boot: Function that returns the random number that identifies the start of the
                 site whose messages are sent.
-            find_messages: Function that looks up messages by their channel and the numbers of
-                the first and last one. It returns the number of the first message that is
-                found, the payloads of consecutive messages, and the number of messages that the
-                site has published.
+            find_messages: Function that looks up messages from their channel and the numbers of
+                the first and last one. It returns the number of the first message found, the
+                payloads of consecutive messages, and the number of messages that the site has
+                published.
 
         Returns:
-            The number of messages in the reply. None if no request was waiting.
+            The number of messages in the reply, or None if no request was waiting.
         """
         query = self._backfill_queries.poll()
         if query is None:
             return None
 
         def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
-            """Finds the messages that a request asks for."""
+            """Looks up the messages that a request asks for."""
             return find_messages(request.channel, request.first, request.last)
 
         return answer_backfill(query, self._info.member, find_boot(), find_requested)

@@ -1,32 +1,30 @@
-"""Decides when the control loop of an arm runs, and measures the clocks of the other arms.
+"""Schedules the control loop of an arm, and measures the clocks of the other arms.
 
-The control loop of each arm computes once per period, a tick. Tick k is due k * 10^9 // rate_hz
-ns after the epoch, the common start time of the session. If several loops run on one machine,
-they wake up at different times in the period, so that they do not compete for the processors
-(`find_turn_ns`).
+The control loop of each arm runs once per tick. Tick k is due k * 10^9 // rate_hz ns after the
+epoch, the common start time of the session. If several loops run on one machine, their wake-ups
+are spread over the tick, so that they do not compete for the processors (`find_turn_ns`).
 
-In each tick, an arm sends its state, a sample, to the arms that follow it. An arm (its process
-is called a site) measures the connection from each peer, an arm that it follows, with four
-times:
+In each tick, a site sends the state of its arm (a sample) to the sites that follow it. Each
+site measures the connection from every peer using four times:
 
     t1: this site sends a sample           (this site's clock)
     t2: the peer receives that sample      (the peer's clock)
     t3: the peer sends a sample of its own (the peer's clock)
     t4: this site receives that sample     (this site's clock)
 
-The sample of the peer contains t3, its own sending time. It also contains t2, as the
-confirmation (echo) that the sample of this site has arrived. No message can arrive before it
-was sent. Therefore the offset of the peer's clock (peer minus local) is at most t2 - t1 and at
-least t3 - t4. `offset` computes an estimate from the tightest of these limits.
+The peer's sample contains its own sending time t3. It also contains t2, as the acknowledgement
+(echo) of this site's sample. No message can arrive before it was sent. The offset of the peer's
+clock (peer minus local) is therefore at most t2 - t1 and at least t3 - t4. `offset` computes an
+estimate from the tightest of these limits.
 
 Invariant:
-    - Ticks are due on the clock of the leader, the first site of the scenario, to the
+    - Ticks are due on the clock of the leader (the first site of the scenario), exact to the
       nanosecond (law L1 of docs/develop/design.md).
     - A site on another machine follows the leader's clock by running its own schedule slightly
-      faster or slower, by at most SLEW_LIMIT, and never by a step, so that no tick is skipped
+      faster or slower, by at most SLEW_LIMIT. The schedule never steps, so no tick is skipped
       or repeated. If the leader disconnects, the site continues with the last estimate.
-    - Measured delays never decide whether a sample is used. If a sample seems to arrive before
-      it was sent, this is counted as a clock fault, but the sample is still used.
+    - Measured delays never decide whether a sample is used. A sample that seems to arrive
+      before it was sent is counted as a clock fault, but still used.
 """
 
 from array import array
@@ -48,20 +46,19 @@ from .offset import (
 from .topics import ticks_per_stats
 
 SLEW_LIMIT = 200_000.0
-"""Largest deviation of the rate of a schedule from the rate of its clock, in ns/s (200 ppm)."""
+"""Maximum deviation of the rate of a schedule from that of its clock, in ns/s (200 ppm)."""
 _CORRECTION_TIME_S = 2.0
 """Time constant with which a schedule corrects its error, in s.
 
-It is long compared with the noise of an offset estimate, so that the noise is averaged.
+It is long enough to average out the noise of an offset estimate.
 """
 
 
 class TickSchedule:
-    """Times at which the ticks of one site (arm controller) are due, on the clock of that site.
+    """Times at which the ticks of one site are due, on the clock of that site.
 
-    Tick k is due at a time that grows linearly with k. The rate of growth can be adjusted from
-    any tick (control period) onwards, so that the site keeps the same schedule as the leader,
-    the first site of the scenario, although their clocks differ.
+    The due time grows linearly with the tick number. The rate can be adjusted at any tick,
+    which keeps the site on the same schedule as the leader although their clocks differ.
 
     Args:
         epoch_ns: Time of tick 0 on the site's clock, in ns.
@@ -70,7 +67,8 @@ class TickSchedule:
     Attributes:
         slew: Time by which each second of the schedule is lengthened, in ns/s. Negative if the
             schedule runs faster than the site's clock.
-        error_ns: Lateness compared with the leader's schedule at the last `adjust_rate`, in ns.
+        error_ns: Lateness relative to the leader's schedule at the last call to `adjust_rate`,
+            in ns.
     """
 
     def __init__(self, epoch_ns: int, rate_hz: int) -> None:
@@ -83,24 +81,24 @@ class TickSchedule:
         self._slew_per_ns = 0.0
 
     def due_ns(self, k: int) -> int:
-        """Returns the time at which a control period (tick) is due, on the site's clock, in ns.
+        """Returns the time at which a tick is due, on the site's clock, in ns.
 
         Args:
-            k: Number of the tick (period of the control loop).
+            k: Number of the tick.
         """
         passed_ns = k * NS_PER_S // self._rate_hz - self._base_nominal_ns
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
 
     def adjust_rate(self, k: int, error_ns: int, drift: float) -> None:
-        """Adjusts the rate from tick `k` on, so that the schedule approaches the leader's.
+        """Adjusts the rate from tick `k` onwards to bring the schedule closer to the leader's.
 
-        The new rate compensates the drift between the clocks, and reduces the error with the
+        The new rate compensates for the drift between the clocks, and reduces the error with
         time constant `_CORRECTION_TIME_S`. It is limited to `SLEW_LIMIT`.
 
         Args:
-            k: Number of the tick (period of the control loop). It must not be earlier than the
-                tick of the previous adjustment.
-            error_ns: Lateness of the tick compared with the leader's schedule, in ns.
+            k: Number of the tick. It must not be earlier than the tick of the previous
+                adjustment.
+            error_ns: Lateness of the tick relative to the leader's schedule, in ns.
             drift: Rate of the leader's clock relative to the site's clock, in ns/s.
         """
         self._base_ns = self.due_ns(k)
@@ -115,19 +113,16 @@ WINDOW_NS = 1_000_000_000
 """Length of a window of time stamps, from which an offset is estimated, in ns."""
 FIRST_WINDOW_NS = 100_000_000
 FIRST_WINDOWS = 5
-"""The first windows are shorter, so that better offsets soon replace those of the pings."""
+"""Number of shorter windows at the start, which quickly improve on the offsets from pings."""
 _NO_DELAY_NS = 1 << 62
-"""Initial value of a smallest delay, larger than any delay that can be measured."""
+"""Initial value for the search of a minimum delay, larger than any measurable delay, in ns."""
 
 
 class SentStamps:
-    """Stores the times at which the latest samples of this site were sent, by tick.
+    """Stores when this site sent its most recent samples, indexed by tick.
 
-    When a peer's echo of a sample arrives, its sending time is looked up here. The capacity of
-    16 384 ticks is enough for round trips of several seconds.
-
-    A sample is the state that a site (arm controller) publishes in one tick, a period of its
-    control loop.
+    When a peer echoes a sample, the sending time is looked up here. The capacity of 16 384
+    ticks is enough for round trips of several seconds.
     """
 
     def __init__(self, capacity: int = 1 << 14) -> None:
@@ -135,12 +130,10 @@ class SentStamps:
         self._entries = array("q", [-1, 0]) * capacity  # tick and sending time, alternately
 
     def record(self, tick: int, sent_ns: int) -> None:
-        """Stores when a site sent its state of one control period (tick).
-
-        The oldest stored time is overwritten.
+        """Stores the time at which the sample of a tick was sent, replacing the oldest entry.
 
         Args:
-            tick: Number of the tick (period of the control loop).
+            tick: Number of the tick.
             sent_ns: Time of sending on the local clock, in ns.
         """
         slot = 2 * (tick % self._capacity)
@@ -150,11 +143,10 @@ class SentStamps:
     def find_ns(self, tick: int) -> int | None:
         """Returns the time at which the sample of a tick was sent, on the local clock, in ns.
 
-        The result is None if that time is not stored any more, or if no sample was sent in that
-        tick.
+        None if that time is no longer stored, or if no sample was sent in that tick.
 
         Args:
-            tick: Number of the tick (period of the control loop).
+            tick: Number of the tick.
         """
         slot = 2 * (tick % self._capacity)
         return self._entries[slot + 1] if self._entries[slot] == tick else None
@@ -163,8 +155,6 @@ class SentStamps:
 class PeerClock(NamedTuple):
     """Clock of a peer, as known when the session starts or when the peer joins.
 
-    A peer is another site (arm controller) whose samples (states) this site receives.
-
     Attributes:
         name: Name of the peer.
         epoch_ns: Time of tick 0 on the peer's clock, in ns.
@@ -172,7 +162,7 @@ class PeerClock(NamedTuple):
             this index.
         estimate: Offset of the peer's clock.
         estimator: Estimator that already contains the limits from pings. None if the peer runs
-            on this machine, and therefore on this clock.
+            on this machine, and therefore shares its clock.
     """
 
     name: str
@@ -183,19 +173,16 @@ class PeerClock(NamedTuple):
 
     @property
     def is_own(self) -> bool:
-        """True if the other site runs on this machine, so that both have the same clock."""
+        """True if the peer runs on this machine and therefore shares its clock."""
         return self.estimator is None
 
 
 class LinkTimingMonitor:
     """Measures the delay of one link, and the offset between the clocks of its two sites.
 
-    The site (arm controller) at the receiving end of the link creates the monitor, and passes
-    every sample of the peer to `receive`. Offsets are estimated from windows of time stamps. An
-    impossible combination of stamps is a fault: it shows that a clock has stepped.
-
-    A link is the directed connection from one site to another. A sample is the state that a
-    site publishes in each period of its control loop.
+    The site at the receiving end of the link creates the monitor and passes every sample from
+    the peer to `receive`. Offsets are estimated from windows of time stamps. An impossible
+    combination of time stamps counts as a fault, since it shows that a clock has stepped.
 
     Args:
         peer: Clock of the sending peer.
@@ -203,16 +190,17 @@ class LinkTimingMonitor:
 
     Attributes:
         peer: Clock of the sending peer.
-        offset: Offset of the peer's clock over time, with which delays are computed.
+        offset: Offset of the peer's clock over time, used to compute delays.
         faults: Number of clock faults: impossible time stamps, and windows that contradict
             earlier ones.
-        newest: Newest sample of the peer whose arrival this site has not confirmed yet: its
-            tick, and its arrival on the local clock in ns. None if all samples are confirmed.
-        worst_ns: Longest time by which a sample seemed to arrive before it was sent, since the
-            last event about a fault, in ns. 0 if there was none.
+        newest: Newest sample from the peer whose arrival this site has not acknowledged yet:
+            its tick, and its arrival on the local clock in ns. None if all samples are
+            acknowledged.
+        worst_ns: Longest time by which a sample seemed to arrive before it was sent since the
+            last event about a fault, in ns. 0 if there was no such sample.
         contradicted: True if a window has contradicted earlier windows since that event.
         is_unacknowledged: True if an event has reported that the peer acknowledges no samples,
-            and no event has reported that it acknowledges samples again.
+            and no later event has reported that it acknowledges samples again.
     """
 
     def __init__(self, peer: PeerClock, sent: SentStamps) -> None:
@@ -223,9 +211,9 @@ class LinkTimingMonitor:
         self.admit(peer)
 
     def admit(self, peer: PeerClock) -> None:
-        """Restarts the measurement of delays on a network link, after its sender was restarted.
+        """Restarts the delay measurement of a link after its sender has been restarted.
 
-        The new process may run on another machine, and therefore on another clock.
+        The new process may run on a different machine, and therefore on a different clock.
 
         Args:
             peer: Clock of the new process.
@@ -249,10 +237,10 @@ class LinkTimingMonitor:
         self._open_window()
 
     def _open_window(self) -> None:
-        """Begins a new interval of time, in which the smallest delay per direction is sought.
+        """Begins a new time window, in which the minimum delay per direction is determined.
 
-        Only the smallest delay is kept, because it gives the tightest limit of the offset
-        between the clocks.
+        Only the minimum is kept, because it gives the tightest limit on the offset between the
+        clocks.
         """
         self._smallest_outward_ns = _NO_DELAY_NS
         self._smallest_return_ns = _NO_DELAY_NS
@@ -260,14 +248,13 @@ class LinkTimingMonitor:
         self._floor: OffsetLimit | None = None
 
     def receive(self, sample: PeerSample, arrived_ns: int) -> int:
-        """Measures the delay of a sample, and the delays of local samples that it confirms.
+        """Measures the delay of a sample in ns, and of the local samples that it acknowledges.
 
         A sample contains echoes: for samples that the peer has received, the time of arrival on
         the peer's clock. The echo of a local sample gives the delay from this site to the peer.
 
         Args:
-            sample: The sample as it has arrived: the state of the peer in one tick, with
-                echoes.
+            sample: A sample received from the peer, including echoes.
             arrived_ns: Time of its arrival on the local clock, in ns.
 
         Returns:
@@ -312,9 +299,7 @@ class LinkTimingMonitor:
         return delay_ns
 
     def is_receiving(self, now_ns: int) -> bool:
-        """Returns True if a message of the peer has arrived recently, within _UNHEARD_NS.
-
-        A peer (another site) publishes its state in each period of its control loop.
+        """Returns True if a message from the peer has arrived within the last _UNHEARD_NS.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -322,19 +307,18 @@ class LinkTimingMonitor:
         return self._received_ns >= 0 and now_ns - self._received_ns <= _UNHEARD_NS
 
     def is_acknowledged(self, now_ns: int) -> bool | None:
-        """Determines whether the peer still receives the samples of this site (arm controller).
+        """Determines whether the peer is still receiving the samples of this site.
 
-        The samples of the peer (their published states) confirm which samples of this site it
-        has received. If they arrive, but have confirmed nothing new for _UNHEARD_NS, the peer
-        does not receive this site.
+        The peer's samples acknowledge the samples that it has received from this site. If they
+        keep arriving but have acknowledged nothing new for _UNHEARD_NS, the peer is not
+        receiving this site.
 
         Args:
             now_ns: Present time on the local clock, in ns.
 
         Returns:
-            True if the peer receives this site, and False if it does not. None if this is not
-            known, because the peer has not confirmed any sample yet, or because no samples of
-            the peer arrive.
+            True if the peer is receiving this site, and False if not. None if unknown, because
+            the peer has not acknowledged any sample yet or no samples from the peer arrive.
         """
         has_confirmed_any = self._acknowledged_tick >= 0
         if not has_confirmed_any or not self.is_receiving(now_ns):
@@ -343,12 +327,12 @@ class LinkTimingMonitor:
         return unconfirmed_ns <= _UNHEARD_NS
 
     def close_window(self, now_ns: int, slew_ns: int) -> OffsetEstimate | None:
-        """Estimates the clock offset from the present window of time, once it is long enough.
+        """Estimates the clock offset from the current time window, once it is long enough.
 
-        Afterwards the next window begins. The offset with which delays are computed approaches
-        the new estimate gradually. If the window contradicts earlier windows, a clock has
-        stepped, and the event is counted as a fault. If no estimate is possible, the bounds of
-        the offset are widened, and the next windows are short.
+        The next window then begins, and the offset used to compute delays gradually approaches
+        the new estimate. A window that contradicts earlier ones shows that a clock has stepped,
+        and is counted as a fault. If no estimate is possible, the bounds of the offset are
+        widened, and the next windows are short.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -356,9 +340,8 @@ class LinkTimingMonitor:
                 estimate, in ns.
 
         Returns:
-            The new estimate. None if the window is not long enough yet. Also None if the peer,
-            the site (arm controller) that sends, runs on this machine, where both sites use the
-            same clock.
+            The new estimate. None if the window is not long enough yet, or if the peer runs on
+            this machine, where both sites use the same clock.
         """
         estimator = self.peer.estimator
         if estimator is None:
@@ -387,15 +370,15 @@ class LinkTimingMonitor:
     def pop_measurements(self, now_ns: int) -> dict[str, int]:
         """Returns the offset and the delays of this link, and discards the measured delays.
 
-        The offset and its error bound are those at the present time. The delays are those
-        measured since the last call.
+        The offset and its error bound apply to the present time. The delays are those measured
+        since the last call.
 
         Args:
             now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The fields of `LinkStats` about the timing of this link. A delay of -1 means that
-            nothing was measured.
+            The fields of `LinkStats` that describe the timing of this link. A delay of -1 means
+            that nothing was measured.
         """
         delays = sorted(self._delays)
         round_trip_ns = self._shortest_round_trip_ns
@@ -420,26 +403,26 @@ class LinkTimingMonitor:
 
 
 FAULT_EVERY_NS = 1_000_000_000
-"""Shortest time between two events about clock faults of one peer, in ns."""
+"""Minimum time between two events about clock faults of the same peer, in ns."""
 _UNHEARD_NS = 200_000_000
-"""Time without a new acknowledgement after which a peer counts as not receiving this site.
+"""Time with no new acknowledgement after which a peer counts as not receiving this site.
 
-The condition applies only while samples of the peer itself arrive.
+The condition applies only while samples from the peer itself arrive.
 """
 _FIRST_BOUND_NS = 2_000_000
-"""Margin that is added to the clock error that a joining site states, in ns."""
+"""Margin added to the clock error reported by a joining site, in ns."""
 
 
 ClockNotice = dict[str, Any]
-"""Fields of an event about a peer's clock, or about a peer that does not receive this site."""
+"""Fields of an event about a peer's clock, or about a peer that is not receiving this site."""
 
 
 def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
-    """Returns the delay of a site's wake-up after the start of a control period, in ns.
+    """Returns how long after the start of a tick a site wakes up, in ns.
 
-    If all sites (arm controllers) of a machine woke up at the same time, they would compete for
-    its processors. The sites are spread over half of a period. A sample (sent state) of the
-    last site thus still arrives well before the next tick of the first site.
+    If all sites on a machine woke up at the same time, they would compete for its processors.
+    Their wake-ups are spread over half a tick, which leaves enough time for the sample of the
+    last site to arrive before the next tick of the first site.
 
     Args:
         index: Index of the site among the sites on its machine.
@@ -450,24 +433,21 @@ def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
 
 
 class SiteTiming:
-    """Schedule of a site's ticks, and timing of the links from its peers.
+    """Schedules the ticks of a site, and measures the timing of the links from its peers.
 
-    The site (arm controller) asks for the time of its next wake-up, reports each sample that it
-    sends, and calls `update_clocks` ten times a second.
-
-    A tick is one period of the control loop. A sample is the state that a site publishes in a
-    tick, and a link is the directed connection from one site to another.
+    The site asks for the time of its next wake-up, reports each sample that it sends, and calls
+    `update_clocks` ten times per second.
 
     Args:
         epoch_ns: Time of tick 0 on the site's clock, in ns.
         rate_hz: Tick rate of the site.
         peers: Clocks of the peers.
         leader: Name of the site whose schedule all sites follow.
-        turn_ns: Delay of each wake-up after the start of the period, see `find_turn_ns`.
+        turn_ns: Delay of each wake-up after the start of the tick, see `find_turn_ns`.
 
     Attributes:
         schedule: Times at which the ticks are due.
-        turn_ns: Delay of each wake-up after the start of the period, in ns.
+        turn_ns: Delay of each wake-up after the start of the tick, in ns.
         monitors: Timing of the link from each peer.
     """
 
@@ -479,7 +459,7 @@ class SiteTiming:
         leader: str,
         turn_ns: int = 0,
     ) -> None:
-        """Starts the schedule of control periods with first estimates of the other clocks."""
+        """Starts the schedule of ticks, with initial estimates of the other clocks."""
         self.schedule = TickSchedule(epoch_ns, rate_hz)
         self.turn_ns = turn_ns
         self._epoch_ns = epoch_ns
@@ -496,20 +476,17 @@ class SiteTiming:
     def deadline_ns(self, k: int) -> int:
         """Returns the time at which the process wakes up for a tick, on its own clock, in ns.
 
-        This is the time at which the tick (control period) is due, plus the delay `turn_ns`.
+        This is the time at which the tick is due, plus the delay `turn_ns`.
 
         Args:
-            k: Number of the tick (period of the control loop).
+            k: Number of the tick.
         """
         return self.schedule.due_ns(k) + self.turn_ns
 
     def list_initial_notices(self) -> list[ClockNotice]:
-        """Returns the initial offsets of other sites' clocks, as events for the log.
+        """Returns the initial clock offsets of the peers as events, one per peer, for the log.
 
-        Peers (other sites) on this machine have no offset and are left out.
-
-        Returns:
-            One event per peer on another machine. Empty if there are no such peers.
+        Peers on this machine have no offset and are left out.
         """
         return [
             _describe_estimate(monitor, 0, self._epoch_ns)
@@ -526,15 +503,15 @@ class SiteTiming:
     ) -> list[ClockNotice]:
         """Starts to measure the link from a peer that joins, or rejoins, a running session.
 
-        The peer states when the epoch was on its own clock, and how accurate this time is. The
-        first estimate of the offset between the clocks is computed from it, and its error bound
-        is wide, because no time stamps have been exchanged yet.
+        The peer reports the time of the epoch on its own clock, and how accurate this time is.
+        This yields the first estimate of the offset between the clocks. Its error bound is
+        wide, because no time stamps have been exchanged yet.
 
         Args:
             index: Index of the peer among all peers of this site.
             t_ns: Nominal time of the peer's first tick, in ns since the epoch (the common start
                 of the session).
-            epoch_ns: Time of the epoch on the peer's clock, as the peer states it, in ns.
+            epoch_ns: Time of the epoch on the peer's clock, as reported by the peer, in ns.
             bound_ns: Largest error of `epoch_ns`, in ns. None if the peer runs on this machine.
 
         Returns:
@@ -567,25 +544,23 @@ class SiteTiming:
         return [_describe_estimate(monitor, k, due_ns)]
 
     def record_sent(self, tick: int, now_ns: int) -> int:
-        """Stores when the state of a tick was sent, so that its delay can be measured later.
+        """Stores when a tick's sample was sent, and returns that time in ns since the epoch.
+
+        The stored time is needed to measure the delay of the sample later.
 
         Args:
-            tick: Number of the tick (period of the control loop).
+            tick: Number of the tick.
             now_ns: Time of sending on the site's clock, in ns.
-
-        Returns:
-            The time of sending, in ns since the epoch, the common start of the session.
         """
         self._sent.record(tick, now_ns)
         return now_ns - self._epoch_ns
 
     def pop_echo(self) -> list[tuple[int, int, int]]:
-        """Returns the confirmations of received samples that this site sends to its peers.
+        """Returns the acknowledgements (echoes) of received samples to be sent to the peers.
 
-        Every sample that a site (arm controller) publishes contains, for each peer, the tick
-        (control period) and the time of arrival of the newest sample received from that peer
-        (an "echo"). From it, the peer computes the delay of the link to this site. Each arrival
-        is confirmed only once.
+        Every sample that a site publishes contains one echo per peer: the tick and the arrival
+        time of the newest sample received from that peer. From the echo, the peer computes the
+        delay of the link to this site. Each arrival is acknowledged only once.
 
         Returns:
             For each peer from which a sample has arrived since the last call: the index of the
@@ -603,24 +578,23 @@ class SiteTiming:
     def update_clocks(self, k: int, now_ns: int) -> list[ClockNotice]:
         """Updates the clock offset of one peer, and adjusts the schedule to the leader's.
 
-        The leader is the first site (arm controller) of the scenario. All sites follow its
-        schedule. If it runs on another machine, the error of the local schedule is computed
-        with the smoothed offset of the leader's clock: the time on the leader's clock when tick
-        k is due at this site, minus the nominal time k / rate of this tick, both since the
-        epoch, the start of the session. The error is positive if the tick is late compared with
-        the leader's schedule.
+        All sites follow the schedule of the leader (the first site of the scenario). If the
+        leader runs on another machine, the error of the local schedule is computed with the
+        smoothed offset of the leader's clock: the time on the leader's clock when tick k is due
+        at this site, minus the nominal time k / rate of this tick, both since the epoch (the
+        start of the session). The error is positive if the tick is late relative to the
+        leader's schedule.
 
-        An estimate of an offset takes a considerable part of a period. Therefore each call
-        estimates the offset of at most one peer.
+        Estimating an offset takes a considerable part of a tick, so each call processes at most
+        one peer.
 
         Args:
-            k: Number of the next tick (period of the control loop). The adjusted schedule
-                applies from this tick on.
+            k: Number of the next tick, from which the adjusted schedule applies.
             now_ns: Present time on the site's clock, in ns.
 
         Returns:
-            Events about new estimates, about clock faults, and about peers that do not receive
-            this site.
+            Events about new estimates, about clock faults, and about peers that are not
+            receiving this site.
         """
         due_ns = self.schedule.due_ns(k)
         notices = self._update_next_estimate(k, now_ns, due_ns)
@@ -637,10 +611,10 @@ class SiteTiming:
         return notices
 
     def _update_next_estimate(self, k: int, now_ns: int, due_ns: int) -> list[ClockNotice]:
-        """Estimates the clock offset of at most one peer. The peers are taken in turn.
+        """Estimates the clock offset of at most one peer, taking the peers in turn.
 
-        One estimate takes a considerable part of a period. Several of them in one call would
-        make the next tick late.
+        One estimate takes a considerable part of a tick. Several of them in one call would
+        delay the next tick.
 
         Args:
             k: Next tick.
@@ -662,12 +636,12 @@ class SiteTiming:
         """Returns the events about a peer's clock faults and about its acknowledgements.
 
         Clock faults are reported at most once per `FAULT_EVERY_NS`. If the peer no longer
-        confirms the samples of this site (arm controller), this is reported once, and its end
-        is reported as well.
+        acknowledges the samples of this site, this is reported once when it begins and once
+        when it ends.
 
         Args:
             index: Index of the peer.
-            k: Next tick (control period).
+            k: Next tick.
             now_ns: Present time on the site's clock, in ns.
         """
         monitor = self.monitors[index]
@@ -689,16 +663,16 @@ class SiteTiming:
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns timing statistics of the site, and begins new statistics of measured delays.
+        """Returns the timing statistics of the site, and resets the measured delays.
 
         Args:
             now_ns: Present time on the local clock, in ns.
 
         Returns:
             The timing fields of `LinkStats`. The first fields are the lateness of this site
-            (arm controller) compared with the leader's schedule of ticks (control periods), and
-            the correction of its own rate. Each other field is a dictionary of a measured
-            quantity, by the name of the site at the other end of the link.
+            relative to the leader's schedule and the correction of its own rate. Each other
+            field is a dictionary that maps the name of the site at the other end of a link to
+            the measured quantity.
         """
         stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,
@@ -713,11 +687,11 @@ class SiteTiming:
 def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> ClockNotice:
     """Returns the event that states the offset and the drift of a peer's clock.
 
-    Users and the log thus learn how accurate the measured delays are.
+    It shows users and readers of the log how accurate the measured delays are.
 
     Args:
-        monitor: Timing of the link from the peer (other site).
-        k: First tick (control period) to which the offset applies.
+        monitor: Timing of the link from the peer.
+        k: First tick to which the offset applies.
         local_ns: Time of that tick on the local clock, in ns.
     """
     offset = monitor.offset
@@ -742,10 +716,10 @@ def _describe_estimate(monitor: LinkTimingMonitor, k: int, local_ns: int) -> Clo
 
 
 def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
-    """Returns the event that a peer's clock, or the local clock, has stepped.
+    """Returns the event that reports that a peer's clock, or the local clock, has stepped.
 
-    The evidence is a sample (sent state) that seems to have arrived before it was sent, or a
-    window of time stamps that contradicts earlier windows.
+    The evidence is a sample that seems to have arrived before it was sent, or a window of time
+    stamps that contradicts earlier windows.
     """
     name = monitor.peer.name
 
@@ -769,12 +743,12 @@ def _describe_fault(monitor: LinkTimingMonitor) -> ClockNotice:
 def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice:
     """Returns the event that a peer no longer receives this site, or receives it again.
 
-    Samples of the peer arrive in both cases. The event tells users that the connection is
-    interrupted in the other direction only, from this site (arm controller) to the peer.
+    Samples from the peer arrive in both cases. The event tells users that the connection is
+    interrupted only in the other direction, from this site to the peer.
 
     Args:
         monitor: Timing of the link from the peer.
-        k: Present tick (control period), which the event states in its field `ticks`.
+        k: Current tick, which the event states in its field `ticks`.
     """
     name = monitor.peer.name
     if monitor.is_unacknowledged:
@@ -791,22 +765,22 @@ def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice
 
 
 _LINK_COUNTS = ("accepted", "late", "duplicate", "refused", "lost", "superseded", "copies")
-"""Counts of a link that the kernel keeps, and that `LinkStats` contains for each peer."""
+"""Counters of a link kept by the kernel, which `LinkStats` contains for each peer."""
 
 
 class LoopStats:
-    """Statistics of a control loop and its network links, published ten times a second.
+    """Statistics of a control loop and its network links, published ten times per second.
 
     Args:
-        site: The site (arm controller) in the simulation kernel, which counts the samples (sent
-            states) that arrive on each link.
+        site: The site in the simulation kernel, which counts the samples that arrive on each
+            link.
         boot: Random number that identifies this start of the site's process.
 
     Attributes:
-        dropped: Number of messages that were dropped since the start, by reason.
-        overruns: Number of ticks (periods of the control loop) since the start that began after
-            the next tick was due, or that were skipped.
-        skipped: Number of ticks since the start that were skipped.
+        dropped: Mapping from reason to the number of messages dropped since the start.
+        overruns: Number of ticks since the start that began after the next tick was due, or
+            that were skipped.
+        skipped: Number of ticks skipped since the start.
     """
 
     def __init__(self, site: Site, boot: int) -> None:
@@ -823,20 +797,18 @@ class LoopStats:
 
     @property
     def late_ticks(self) -> int:
-        """Number of control periods (ticks) that began after the next one was already due."""
+        """Number of ticks that began after the next tick was already due."""
         return self.overruns - self.skipped
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Updates the statistics with one tick.
+        """Adds one tick to the statistics.
 
-        The statistics contain the sums since the start, and the largest values since the last
-        publication.
+        The statistics contain sums since the start, and maxima since the last publication.
 
         Args:
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
-            skipped: Number of ticks (periods of the control loop) that were skipped before this
-                tick.
+            skipped: Number of ticks that were skipped before this tick.
         """
         self.overruns += skipped
         self.skipped += skipped
@@ -847,14 +819,14 @@ class LoopStats:
         self.overruns += late_us >= self._period_us
 
     def is_due(self, k: int, skipped: int = 0) -> bool:
-        """Returns True if the site (arm controller) publishes its statistics after tick `k`.
+        """Returns True if the site publishes its statistics after tick `k`.
 
-        Statistics are published every `ticks_per_stats` ticks. If such a tick was skipped, they
-        are published after the next tick that was executed.
+        Statistics are published every `ticks_per_stats` ticks. If such a tick is skipped, they
+        are published after the next tick that is executed.
 
         Args:
-            k: The tick (period of the control loop).
-            skipped: Number of ticks (periods of the control loop) that were skipped before it.
+            k: Number of the tick.
+            skipped: Number of ticks that were skipped before it.
         """
         # Number of ticks since the last tick at which statistics were due.
         ticks_since_due = k % self._ticks_per_stats
@@ -863,10 +835,10 @@ class LoopStats:
     def pop_stats(
         self, output: TickRecord, measured: Mapping[str, Any] | None = None
     ) -> LinkStats:
-        """Returns the statistics after a tick, and resets the largest times in them.
+        """Returns the statistics after a tick, and resets the maxima.
 
-        These are the largest lateness of a tick and the largest computing time since the last
-        call.
+        The maxima are the largest lateness and the largest computing time of a tick since the
+        last call.
 
         Args:
             output: Result of the tick.

@@ -1,14 +1,14 @@
-"""Defines the network addresses ("keys") and the numbers of the messages of a session.
+"""Defines the keys under which the messages of a session are published, and their numbering.
 
 Messages are exchanged over Zenoh under keys of the form trilat/<session>/<member>/<channel>.
 The member is the process that sends them, such as the one that controls the arm "m1", and the
-channel is the kind of the messages. The key of a liveliness token, which shows that a process
-is present, has the channel "alive" and ends with a random number that identifies the start of
-the process (its boot).
+channel is the kind of message. The key of a liveliness token, which shows that a process is
+present, has the channel "alive" and ends with a random number that identifies the start of the
+process (its boot).
 
-Messages of a channel are numbered consecutively, so that a recorder notices lost messages. The
-number of a record, the stored result of one period of a control loop (tick), is the number of
-the tick. Statistics, which are published ten times a second, are numbered from 0.
+The messages of a channel are numbered consecutively, so that a recorder can detect lost
+messages. A record has the number of its tick. Statistics, which are published ten times per
+second, are numbered from 0.
 """
 
 from collections.abc import Iterator
@@ -17,9 +17,9 @@ from typing import NamedTuple
 from .bus import PresenceInbox
 
 ROOT = "trilat"
-"""Beginning of all keys."""
+"""Prefix of all keys."""
 RECORDER = "recorder"
-"""Name of every recorder as a member."""
+"""Member name used by every recorder."""
 STATE = "state"
 """Channel of the records that a site publishes for the recorder, one per tick."""
 LINK = "link"
@@ -31,11 +31,11 @@ INFO = "info"
 ALIVE = "alive"
 """Channel of liveliness tokens."""
 PING = "ping"
-"""Channel of pings, which measure the offset between clocks."""
+"""Channel of pings, which are used to measure the offset between clocks."""
 SET = "set"
 """Channel of requests for changes."""
 STOP = "stop"
-"""Channel of the order to stop, which all members may send. Other changes use `SET`."""
+"""Channel of the stop command, which all members may send. Other changes use `SET`."""
 SAMPLE = "sample"
 """Channel of the samples that a site publishes for its peers, one per tick."""
 PAST = "past"
@@ -45,24 +45,21 @@ STATS = "stats"
 MEASURED = "measured"
 """Channel of the measurements of an external arm."""
 HAND = "hand"
-"""Channel of the targets and forces of an operator, a person or program that moves an arm."""
+"""Channel of the targets and forces of an operator."""
 ENABLE = "enable"
-"""Channel of the reports of a dead-man switch."""
+"""Channel of the reports from a dead-man switch."""
 VIEW = "view"
-"""Channel of a site's states for an operator program in another process."""
+"""Channel of the views that a site sends to an operator program in another process."""
 STATS_PER_SECOND = 10
 """Rate at which a site publishes statistics, in 1/s."""
 
 
 class KeyParts(NamedTuple):
-    """The parts of a key, the text under which a message is published.
-
-    The key trilat/<session>/<member>/<channel> names the session, the process that sends the
-    message (the member), and the stream of messages (the channel).
+    """The parts of a key, which has the form trilat/<session>/<member>/<channel>.
 
     Attributes:
         session: Name of the session.
-        member: Name of the member.
+        member: Name of the member that sends the message.
         channel: Name of the channel.
         boot: In the key of a liveliness token, the number that identifies the start of the
             member's process. Empty in other keys.
@@ -77,8 +74,8 @@ class KeyParts(NamedTuple):
 def presence_key(session: str, member: str) -> str:
     """Returns the key under which the presence of a member can be observed.
 
-    A process shows that it is present by a liveliness token, whose key contains the number of
-    its start. The returned key contains a wildcard, and matches the tokens of all starts of the
+    A process shows that it is present with a liveliness token, whose key contains the number of
+    its start. The returned key contains a wildcard that matches the tokens of all starts of the
     member.
 
     Args:
@@ -106,28 +103,25 @@ def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
 
 
 def key(session: str, member: str, channel: str) -> str:
-    """Returns the network address (key) under which a process publishes one kind of messages.
+    """Returns the key under which a process publishes one kind of message.
 
     Args:
         session: Name of the session.
         member: Name of the member, or "*" for all members.
-        channel: Name of the channel, one stream of messages, such as that of the events.
+        channel: Name of the channel, such as that of the events.
     """
     return f"{ROOT}/{session}/{member}/{channel}"
 
 
 def parse_key(key: str) -> KeyParts | None:
-    """Splits a key, the name under which a message is published, into its parts.
-
-    A liveliness token is a key by which a process shows that it is present. It also contains
-    the boot, a number that identifies one start of the process.
+    """Splits the key of a message or a liveliness token into its parts.
 
     Args:
-        key: The key of a message or of a liveliness token.
+        key: The key.
 
     Returns:
-        The names of the session, the member and the channel, and the boot of a token. None if
-        the key belongs to another program.
+        The names of the session, the member and the channel, plus the boot (the number of the
+        process start) for a token. None if the key belongs to another program.
     """
     root, _, rest = key.partition("/")
     parts = rest.split("/")
@@ -140,7 +134,7 @@ def parse_key(key: str) -> KeyParts | None:
 def ticks_per_stats(rate_hz: int) -> int:
     """Returns the number of ticks from one message with statistics to the next.
 
-    A tick is one period of a site's control loop. Statistics are published ten times a second.
+    Statistics are published ten times per second.
 
     Args:
         rate_hz: Tick rate of the site.
@@ -149,14 +143,14 @@ def ticks_per_stats(rate_hz: int) -> int:
 
 
 def number_message(channel: str, tick: int, rate_hz: int) -> int:
-    """Returns the number of the message that a site (arm controller) publishes after a tick.
+    """Returns the number of the message that a site publishes after a tick.
 
-    Records, the results of ticks, have the number of their tick. Statistics, which are
-    published less often, are numbered from 0.
+    A record has the number of its tick. Statistics, which are published less often, are
+    numbered from 0.
 
     Args:
         channel: `STATE` for records, or `LINK` for statistics.
-        tick: Number of the tick, a period of the control loop.
+        tick: Number of the tick.
         rate_hz: Tick rate of the site.
     """
     return tick // ticks_per_stats(rate_hz) if channel == LINK else tick
@@ -165,13 +159,12 @@ def number_message(channel: str, tick: int, rate_hz: int) -> int:
 def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
     """Returns how many messages of a channel a site publishes in its first `ticks` ticks.
 
-    A tick is one period of the control loop. A site (arm controller) publishes a record (result
-    of a control period) in each tick, and statistics ten times a second.
+    A site publishes a record in each tick, and statistics ten times per second.
 
     Args:
         channel: `STATE` for the records, or `LINK` for the statistics.
-        ticks: Number of ticks, from tick 0 on.
-        rate_hz: Tick rate of the site: periods of its control loop per second.
+        ticks: Number of ticks, starting from tick 0.
+        rate_hz: Tick rate of the site, in Hz.
     """
     if channel != LINK:
         return ticks
@@ -181,14 +174,14 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
 
 
 def count_under_way(channel: str, rate_hz: int) -> int:
-    """Returns how many published messages may be lost if a site (arm controller) is killed.
+    """Returns how many published messages may be lost if a site is killed.
 
     These are the messages of the last 20 ms, which may not have left the machine yet.
 
     Args:
-        channel: `STATE` for the records (results of control periods), of which a site publishes
-            one in each tick. `LINK` for its statistics, which it publishes ten times a second.
-        rate_hz: Tick rate of the site: periods of its control loop per second.
+        channel: `STATE` for the records, which a site publishes in each tick, or `LINK` for the
+            statistics, which it publishes ten times per second.
+        rate_hz: Tick rate of the site, in Hz.
     """
     ticks_in_20_ms = rate_hz // 50
     return 1 if channel == LINK else ticks_in_20_ms
@@ -202,19 +195,18 @@ def skipped_numbers(
 ) -> tuple[int, int]:
     """Returns the numbers that the messages of skipped ticks would have had.
 
-    A site (arm controller) that is late may skip ticks, periods of its control loop, and then
-    publishes no messages for them. Their numbers remain unused, and must not count as lost
-    messages.
+    A site that is late may skip ticks, and publishes no messages for them. The numbers of these
+    messages remain unused and must not be counted as lost messages.
 
     Args:
-        channel: `STATE` for records (results of control periods), or `LINK` for statistics.
+        channel: `STATE` for records, or `LINK` for statistics.
         tick: First tick after the skipped ones.
         skipped: Number of skipped ticks.
         rate_hz: Tick rate of the site.
 
     Returns:
         The number of the first message after the skipped ticks, and the number of messages
-        published before them. These are the arguments of `Account.mark_unpublished`.
+        published before them. Pass both to `Account.mark_unpublished`.
     """
     next_number = number_message(channel, tick, rate_hz)
     published = count_messages(channel, tick - skipped, rate_hz)

@@ -1,18 +1,18 @@
 """Encodes messages to bytes, and decodes and checks bytes from the network or from a log.
 
-The bytes of a message are a map in the format MessagePack with the field names as keys. The
-classes in `messages` and `requests` define the fields. The two messages that an arm publishes
-in every period of its control loop, the record and the sample, are encoded directly from the
-output of the simulation kernel, which is faster than through a message object.
+The bytes of a message are a MessagePack map with the field names as keys. The fields are
+defined by the classes in `messages` and `requests`. The two messages that a site publishes in
+every tick, the record and the sample, are encoded directly from the output of the simulation
+kernel, which is faster than creating a message object first.
 
 Invariant:
     - The decoder does not trust its input, because any program on the network can send
-      messages. Each payload yields either a valid message of an accepted schema version, in
-      which all numbers are finite and within their ranges, or a `WireError`.
-    - The reason of a `WireError` is one of a few short texts. Receivers count the payloads that
-      they drop by the reason.
-    - Records and samples with numbers that are not finite are not encoded. Receivers would
-      refuse them.
+      messages. Each payload yields either a valid message of an accepted schema version, with
+      all values finite and within their ranges, or a `WireError`.
+    - The reason of a `WireError` is one of a small set of short strings. Receivers count
+      dropped payloads per reason.
+    - Records and samples that contain non-finite values are not encoded, since receivers would
+      reject them.
 """
 
 import math
@@ -41,13 +41,13 @@ from .messages import (
 from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, DirectMessage, HandMessage
 
 MAX_BYTES = 65_536
-"""Largest payload of a message, in bytes. `Info` and `Backfill` may be larger."""
+"""Maximum payload of a message, in bytes. `Info` and `Backfill` may be larger."""
 MAX_INFO_BYTES = 64 * 1024 * 1024
-"""Largest payload of an `Info`, in bytes. It contains a scenario with its recorded delays."""
+"""Maximum payload of an `Info`, in bytes. It contains a scenario with its recorded delays."""
 _MAX_PAST_BYTES = 2 * MAX_BYTES
-"""Largest payload of a `Backfill`, in bytes."""
+"""Maximum payload of a `Backfill`, in bytes."""
 SAMPLE_BYTES = 2_048
-"""Largest size of a `PeerSample` without the numbers of its vectors, in bytes."""
+"""Maximum size of a `PeerSample`, excluding the elements of its vectors, in bytes."""
 _NUMBER_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
 
@@ -68,19 +68,18 @@ _SIZE_LIMITS: dict[type[msgspec.Struct], int] = {
     Info: MAX_INFO_BYTES,
     Backfill: _MAX_PAST_BYTES,
 }
-"""Largest payloads of the messages that may be larger than `MAX_BYTES`."""
+"""Maximum payloads of the messages that may exceed `MAX_BYTES`."""
 _isfinite = math.isfinite
 _encode = msgspec.msgpack.Encoder().encode
 
 
 @cache
 def _list_vector_lengths(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
-    """Returns the vectors of a message type by name, with their lengths for a site.
+    """Returns a mapping from each vector field of a message type to its length for a site.
 
     Args:
         kind: The message type.
-        layout: Numbers of joints, peers and parameters of the site (arm controller) that sends
-            the message.
+        layout: Numbers of joints, peers and parameters of the site that sends the message.
     """
     if kind is State:
         # Vectors that the layout does not mention must be absent.
@@ -106,28 +105,26 @@ def encode_state(
     sent_ns: int | None = None,
     echo: Sequence[Sequence[int]] = (),
 ) -> bytes:
-    """Encodes the result of one tick (period of the control loop) of a site as a `State`.
-
-    The result is called a record. It is stored in the log.
+    """Encodes the result of one tick as a `State` (the record that is stored in the log).
 
     Args:
         site: Name of the site.
         boot: Random number that identifies this start of the site's process.
         peers: Names of the site's peers, in the order of `used` in the output.
-        output: Result of the tick, as the simulation kernel computed it.
-        arrivals: Samples that the tick used as inputs, in their order.
+        output: Result of the tick, as computed by the simulation kernel.
+        arrivals: Samples that the tick used as inputs, in order of arrival.
         late_us: Time by which the tick began late, in us.
         busy_us: Computing time of the previous tick, in us.
         sent_ns: Time of sending, in ns since the epoch (the common start of the session) on the
             site's clock. If None, the nominal time of the tick is used, as in simulations.
-        echo: Newest sample that has arrived from each peer, by which the peer can measure the
-            delay to this site, see `State.echo`.
+        echo: Newest sample received from each peer, from which the peer can measure the delay
+            to this site, see `State.echo`.
 
     Returns:
         The payload of the message.
 
     Raises:
-        WireError: A number is not finite.
+        WireError: A value is not finite.
     """
     (
         tick,
@@ -198,25 +195,25 @@ def encode_sample(
     sent_ns: int,
     echo: Sequence[Sequence[int]],
 ) -> bytes:
-    """Encodes the message with which a site publishes its state in one tick to other sites.
+    """Encodes the sample with which a site publishes its state in one tick to its peers.
 
-    A tick is one period of the control loop. This message (sample) is shorter than the record
-    of the same tick, because it contains only what the peers (other sites) need.
+    The sample is shorter than the record of the same tick, because it contains only what the
+    peers need.
 
     Args:
         site: Name of the site.
         boot: Random number that identifies this start of the site's process.
-        output: Result of the tick, as the simulation kernel computed it.
+        output: Result of the tick, as computed by the simulation kernel.
         sent_ns: Time of sending, in ns since the epoch (the common start of the session) on the
             site's clock.
-        echo: Newest sample that has arrived from each peer, by which the peer can measure the
-            delay to this site, see `State.echo`.
+        echo: Newest sample received from each peer, from which the peer can measure the delay
+            to this site, see `State.echo`.
 
     Returns:
         The payload of a `PeerSample`.
 
     Raises:
-        WireError: A number is not finite.
+        WireError: A value is not finite.
     """
     (q, qd, tau_x) = output.shared()
     ch = output.ch
@@ -242,16 +239,13 @@ def encode_sample(
 
 
 def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
-    """Joins consecutive records into blocks, which cost less to send than single records.
-
-    A record is the result of one tick, a period of a site's control loop.
+    """Joins consecutive records into blocks, which are cheaper to send than single records.
 
     Args:
         payloads: The encoded records.
 
     Yields:
-        Blocks of at most `BACKFILL_BYTES`. If a single record is longer, it forms a block
-        alone.
+        Blocks of at most `BACKFILL_BYTES`. A record that is longer forms a block of its own.
     """
     block: list[bytes] = []
     size = 0
@@ -267,13 +261,12 @@ def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
 
 
 def split_states(block: bytes) -> Iterator[bytes]:
-    """Splits a network message with several records into one payload per record.
+    """Splits a message that contains several records into one payload per record.
 
     The records are not decoded.
 
     Args:
-        block: One or more encoded records (results of control periods), as `join_states` joins
-            them.
+        block: One or more encoded records, as joined by `join_states`.
 
     Yields:
         The payload of each record.
@@ -304,14 +297,14 @@ def split_states(block: bytes) -> Iterator[bytes]:
 def encode(message: _Sendable) -> bytes:
     """Encodes a message as the payload that is sent over the network.
 
-    Records (`State`) and samples (`PeerSample`), which are sent in every tick (control period),
-    are encoded by faster functions instead: `encode_state` and `encode_sample`.
+    Records (`State`) and samples (`PeerSample`), which are sent in every tick, have faster
+    encoders: `encode_state` and `encode_sample`.
 
     Args:
         message: The message.
 
     Returns:
-        The payload, which `decode` converts to an equal message.
+        The payload, which `decode` converts back to an equal message.
     """
     return _encode(message)
 
@@ -325,26 +318,25 @@ def decode(
     versions: Collection[int] = (VERSION,),
     layout: Layout | None = None,
 ) -> M:
-    """Decodes a payload that has arrived from the network, and checks the message.
+    """Decodes a payload received from the network, and checks the message.
 
-    Payloads may come from any program on the network. Everything that could harm the caller is
-    therefore checked: the size, the version, the lengths of vectors and all numbers.
+    Payloads may come from any program on the network, so everything that could harm the caller
+    is checked: the size, the version, the lengths of vectors and all values.
 
     Args:
         payload: The encoded message.
         kind: Expected type of the message.
         versions: Accepted versions of the schema. Logs may contain older versions, see
             `READABLE`.
-        layout: Numbers of joints, peers and arm parameters of the sender, from which the
-            lengths of the vectors in the message follow. If None, vectors of any length are
-            accepted.
+        layout: Numbers of joints, peers and arm parameters of the sender, which determine the
+            lengths of the vectors in the message. If None, vectors of any length are accepted.
 
     Returns:
         The message.
 
     Raises:
         WireError: The payload is too large or malformed, has another schema version, contains a
-            number that is not finite, or contains a vector of the wrong length.
+            value that is not finite, or contains a vector of the wrong length.
     """
     return make_decoder(kind, tuple(versions), layout)(payload)  # type: ignore[no-any-return]
 
@@ -357,17 +349,17 @@ def make_decoder(
 ) -> Callable[[bytes], Any]:
     """Returns a function that decodes payloads of one message type, as `decode` does.
 
-    The decoder, the size limit and the lengths of the vectors are looked up only once, and not
-    for every payload.
+    The decoder, the size limit and the vector lengths are looked up once instead of for every
+    payload.
 
     Args:
         kind: Expected type of the messages.
-        versions: Accepted versions of the schema, the definition of the messages' fields.
+        versions: Accepted versions of the schema, which defines the fields of the messages.
         layout: Numbers of joints, peers and parameters of the sender. If None, vectors of any
             length are accepted.
 
     Returns:
-        The function, which raises WireError as `decode` does.
+        The function, which raises WireError under the same conditions as `decode`.
     """
     max_bytes = _SIZE_LIMITS.get(kind, MAX_BYTES)
     parse = _DECODERS[kind].decode
@@ -381,16 +373,16 @@ def make_decoder(
     def decode_payload(payload: bytes) -> Any:
         """Decodes the payload of one message, and checks the message.
 
-        These variables of `make_decoder` depend only on the type of the message and on the
-        layout (numbers of joints, peers and parameters) of the sender:
+        The following variables of `make_decoder` depend only on the message type and on the
+        sender's layout (its numbers of joints, peers and parameters):
 
         - `max_bytes`: largest size of a payload.
         - `parse`: decodes a payload, and checks the types and ranges of the fields.
         - `versions`: accepted versions of the schema. Messages from the network must have the
-          version of this program. For logs, older versions are accepted as well.
+          version of this program. Logs may also have older versions.
         - `get_vectors`: returns the fields of a message that are vectors, such as the joint
           angles. None if the type has no vectors.
-        - `lengths_by_name`: lengths of these vectors, by name.
+        - `lengths_by_name`: mapping from the name of each of these vectors to its length.
         - `required_lengths`: the same lengths as a list. If None, any lengths are accepted.
 
         Args:
@@ -401,7 +393,7 @@ def make_decoder(
 
         Raises:
             WireError: The payload is too large or malformed, has another schema version,
-                contains a number that is not finite, or contains a vector of the wrong length.
+                contains a value that is not finite, or contains a vector of the wrong length.
         """
         if len(payload) > max_bytes:
             size = count_nouns(len(payload), "byte")
@@ -437,10 +429,10 @@ def make_decoder(
 
 
 def make_sample_reader(layout: Layout) -> Callable[[bytes], PeerSample | WireError]:
-    """Returns a function that decodes samples, and returns errors instead of raising them.
+    """Returns a function that decodes samples, returning errors instead of raising them.
 
-    The function returns the sample, or a `WireError` if the payload is not valid. It is called
-    in network threads, in which an exception would be lost.
+    The function returns the sample, or a `WireError` if the payload is invalid. It is called in
+    network threads, where an exception would be lost.
 
     Args:
         layout: Numbers of joints, peers and parameters of the sender.
@@ -448,7 +440,7 @@ def make_sample_reader(layout: Layout) -> Callable[[bytes], PeerSample | WireErr
     decoder: Callable[[bytes], PeerSample] = make_decoder(PeerSample, layout=layout)
 
     def read(payload: bytes) -> PeerSample | WireError:
-        """Returns the decoded sample, or a `WireError` if its bytes are not valid."""
+        """Returns the decoded sample, or a `WireError` if the payload is invalid."""
         try:
             return decoder(payload)
         except WireError as error:
@@ -458,13 +450,13 @@ def make_sample_reader(layout: Layout) -> Callable[[bytes], PeerSample | WireErr
 
 
 def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:
-    """Checks that the vectors of a received message have the lengths of the scenario.
+    """Raises WireError if a vector of a received message does not have the expected length.
 
-    A message with other lengths comes from a program that runs another scenario.
+    Such a message comes from a program that runs a different scenario.
 
     Args:
         vectors: The vectors of a message.
-        lengths: Required lengths, by the name of the vector.
+        lengths: Mapping from the name of each vector to its required length.
 
     Raises:
         WireError: A vector has another length. If it contains joint angles, the reason states
@@ -484,7 +476,7 @@ def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) ->
 def _check_finite(
     message: Any, vectors: tuple[list[float], ...], names: Collection[str]
 ) -> None:
-    """Raises the error for the first vector that contains a number that is not finite.
+    """Raises WireError for the first vector that contains a value that is not finite.
 
     Args:
         message: The message.
@@ -492,7 +484,7 @@ def _check_finite(
         names: Names of the vectors.
 
     Raises:
-        WireError: A number is not finite.
+        WireError: A value is not finite.
     """
     for name, vector in zip(names, vectors, strict=True):
         if not all(map(_isfinite, vector)):

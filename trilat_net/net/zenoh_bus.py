@@ -1,12 +1,13 @@
-"""Implements the network connection of a process (`Bus`) over the library Eclipse Zenoh.
+"""Implements the network connection of a process (`Bus`) with the library Eclipse Zenoh.
 
-Zenoh transports published messages, queries and their replies between the processes of a
-session. Only this module and `ros2_graph` import `zenoh`.
+Zenoh transports published messages, queries and replies between the processes of a session.
+Only this module and `ros2_graph` import `zenoh`.
 
 Invariant:
-    - No method waits for the network, because the control loop of an arm calls them.
-    - If the network is too slow, a publisher drops messages and does not delay its caller. Only
-      a publisher that was opened as patient waits.
+    - No method waits for the network, because the methods are called by the control loop of an
+      arm.
+    - If the network cannot keep up, a publisher drops messages instead of delaying its caller.
+      Only publishers that were opened as patient wait.
     - Replies to a query are collected in a queue that the caller polls.
     - If a connection cannot be opened yet, an error is raised. The caller decides whether to
       try again.
@@ -39,16 +40,16 @@ from .bus import (
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, make_zenoh_config
 
 _QUERY_TIMEOUT_S = 3.0
-"""Time after which Zenoh discards a query without replies, in s."""
+"""Time after which Zenoh discards a query that has received no replies, in s."""
 _SHARED_POOL = (
     "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),"
     "net:(handover:rx),app:(handover:rx))"
 )
 """Zenoh's runtime setting that makes its five thread pools share the threads of one pool."""
 MAX_DEPTH = 100
-"""Largest permitted nesting of a user's Zenoh file.
+"""Maximum nesting depth of a user's Zenoh file.
 
-Zenoh's recursive parser would overflow its stack if the nesting were too deep.
+Deeper nesting would overflow the stack of Zenoh's recursive parser.
 """
 
 
@@ -56,16 +57,15 @@ T = TypeVar("T")
 
 
 def share_threads() -> None:
-    """Makes Zenoh use one thread pool instead of five in sessions that are opened from now on.
+    """Makes Zenoh use one thread pool instead of five in sessions opened from now on.
 
-    With several pools, threads of different pools wake each other for each message, which takes
-    time. The pool has four threads although one is enough for the work: closing a connection
-    whose peer never received its last bytes blocks a thread for up to 10 s
-    (eclipse-zenoh/zenoh#1101). The other threads then continue to serve the other members
-    (processes of a session).
+    With several pools, threads in different pools wake each other up for every message, which
+    costs time. One thread would be enough for the work, but the pool has four: closing a
+    connection whose peer never received its last bytes blocks a thread for up to 10 s
+    (eclipse-zenoh/zenoh#1101), and the remaining threads then keep serving the other members.
 
-    A router must not call this function. A router that waits for room in its output queue
-    blocks the thread that reads, and needs another pool to empty the queue.
+    A router must not call this function. If its output queue is full, it blocks the thread that
+    reads, and needs another pool to empty the queue.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _SHARED_POOL)
 
@@ -78,13 +78,13 @@ class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
 
 
 class _ZenohRing(Generic[T]):
-    """Queue of objects that Zenoh has received, such as messages, replies or tokens.
+    """Queue of objects received by Zenoh, such as messages, replies or tokens.
 
-    An object is converted when it is polled, and not when it arrives.
+    Objects are converted when they are polled, not when they arrive.
 
     Args:
-        channel: Channel of Zenoh into which the objects arrive.
-        read: Function that converts an object into an entry. If it returns None, the object is
+        channel: Zenoh channel in which the objects arrive.
+        read: Function that converts an object to an entry. If it returns None, the object is
             skipped.
     """
 
@@ -94,7 +94,7 @@ class _ZenohRing(Generic[T]):
         self._read = read
 
     def poll(self) -> T | None:
-        """Removes the oldest usable entry from the queue and returns it. None if it is empty.
+        """Removes and returns the oldest usable entry, or returns None if there is none.
 
         An entry is a message or a reply. Entries for which `read` returns None, such as error
         replies, are skipped. The queue of a query also counts as empty once all replies have
@@ -114,11 +114,11 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
     """Returns a Zenoh handler that calls a function with every message, in threads of Zenoh.
 
     The handler also makes these calls cheaper. CPython keeps a data structure for each thread
-    that runs Python code. Zenoh's threads are not created by Python: for them, CPython creates
+    that runs Python code. Because Zenoh's threads are not created by Python, CPython creates
     the structure at the beginning of each call and deletes it at the end, which costs more than
-    the call itself. CPython counts how often a thread has entered and left the interpreter, and
-    deletes the structure when the counts are equal. The handler enters once more in each
-    thread, and never leaves again, so that the structure is kept.
+    the call itself. The structure is deleted when the thread has left the interpreter as often
+    as it has entered it. The handler therefore enters the interpreter one extra time in each
+    thread and never leaves it, which keeps the structure.
 
     Args:
         receive: Function that receives each message.
@@ -126,10 +126,10 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
     thread_locals = threading.local()
 
     def handle(sample: Any) -> None:
-        """Calls `receive` with a message, and makes further calls in this thread cheaper.
+        """Calls `receive` with a message, and makes later calls in this thread cheaper.
 
-        In its first call in a thread, it enters the interpreter once more without leaving it.
-        CPython then keeps its data structure for the thread.
+        The first call in a thread enters the interpreter one extra time without leaving it,
+        which makes CPython keep its data structure for the thread.
         """
         receive(sample)
         is_first_call_in_thread = not hasattr(thread_locals, "kept_state")
@@ -141,14 +141,14 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
 
 
 def _read_sample(sample: Any) -> tuple[str, bytes]:
-    """Returns the key under which a message was published, and its bytes."""
+    """Returns the key and the payload of a published message."""
     return str(sample.key_expr), sample.payload.to_bytes()
 
 
 class _ZenohQuery(NamedTuple):
-    """A request of another process that waits for a reply, received through Zenoh.
+    """A query from another process, received through Zenoh, that is waiting for a reply.
 
-    It implements `Query` of the interface `bus`. The key is the address of the reply.
+    Implements the interface `Query` from `bus`. The key is the address of the reply.
     """
 
     query: zenoh.Query
@@ -156,11 +156,11 @@ class _ZenohQuery(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """Content of the request, as its sender encoded it. Empty if it has no content."""
+        """Content of the query, as encoded by its sender. Empty if the query has no content."""
         return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
     def reply(self, payload: bytes) -> None:
-        """Replies to the request, which then ends for its sender. Only one reply is possible.
+        """Replies to the query, which completes it for the sender. Only one reply is possible.
 
         Args:
             payload: The encoded reply.
@@ -177,18 +177,19 @@ def open_zenoh(
     settings: Mapping[str, Any] | None,
     silent: str,
 ) -> Any:
-    """Connects to the Zenoh network, with the settings of `make_zenoh_config`.
+    """Opens a Zenoh session with the settings of `make_zenoh_config`.
 
     Args:
-        listen: Endpoints at which the session listens.
+        listen: Endpoints on which the session listens.
         connect: Endpoints to which the session connects.
-        mode: "peer" to connect to members (processes of a session) directly, "client" to
-            connect to a router, or "router" to be a router itself.
-        settings: Settings that replace those of this program, from a user's file or from keys.
-        silent: Text of the error if no router answers, with {} in place of the endpoints.
+        mode: "peer" to connect to members directly, "client" to connect to a router, or
+            "router" to act as a router.
+        settings: Settings that override those of this program, from the user's file or from
+            keys.
+        silent: Error message if no router answers, with {} in place of the endpoints.
 
     Raises:
-        UsageError: An endpoint is malformed, or the session cannot listen there.
+        UsageError: An endpoint is malformed, or the session cannot listen on it.
         RouterSilent: The session is a client, and no router answers.
     """
     # Zenoh logs only if the environment variable RUST_LOG is set.
@@ -203,7 +204,7 @@ def open_zenoh(
             raise RouterSilent(silent.format(_endpoint_texts(connect))) from None
         if "in use" in message or "AddrInUse" in message:
             raise UsageError(
-                f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
+                f"cannot listen on {_endpoint_texts(listen)}: the port is in use; "
                 "end the program that uses it, or choose another port with "
                 "--listen tcp/127.0.0.1:PORT"
             ) from None
@@ -214,22 +215,23 @@ def open_zenoh(
 
 
 class ZenohBus:
-    """Network connection of a member over a Zenoh session of its own, see `Bus`.
+    """Network connection of a member over its own Zenoh session, see `Bus`.
 
-    A peer (other site) or a router keeps trying until all endpoints answer. A client connects
-    to the first endpoint that answers at once, and connects again when the connection is lost.
-    A peer reaches the members (processes of a session) to which it is connected. A client or a
-    router reaches all members that the router reaches.
+    In the modes "peer" and "router", the session keeps trying until all endpoints answer. A
+    client connects immediately to the first endpoint that answers, and reconnects when the
+    connection is lost. A peer reaches the members to which it is connected. A client or a
+    router reaches all members that can be reached through the router.
 
     Args:
-        listen: Endpoints at which the session listens.
+        listen: Endpoints on which the session listens.
         connect: Endpoints to which the session connects.
         mode: "peer" to connect to members directly, "client" to connect to a router, or
-            "router" to be a router itself.
-        settings: Settings that replace those of this program, from a user's file or from keys.
+            "router" to act as a router.
+        settings: Settings that override those of this program, from the user's file or from
+            keys.
 
     Raises:
-        UsageError: An endpoint is malformed, or the session cannot listen there.
+        UsageError: An endpoint is malformed, or the session cannot listen on it.
         RouterSilent: The session is a client, and no router answers.
     """
 
@@ -257,8 +259,8 @@ class ZenohBus:
 
         Args:
             key: The key, without wildcards.
-            patient: True if the function waits while the network is too slow, False if it drops
-                the message. A receiver that blocks a patient publisher for 5 s loses its
+            patient: If True, the function waits while the network cannot keep up; if False, it
+                drops the message. A receiver that blocks a patient publisher for 5 s loses its
                 connection.
         """
         publisher = self._session.declare_publisher(
@@ -273,20 +275,20 @@ class ZenohBus:
         return put
 
     def _subscribe(self, key: str, handler: Any) -> Any:
-        """Subscribes to messages through Zenoh, except those that this connection publishes.
+        """Subscribes to messages through Zenoh, excluding those published by this connection.
 
         Args:
             key: Key of the messages; it may contain wildcards.
-            handler: Handler of Zenoh that receives the messages.
+            handler: Zenoh handler that receives the messages.
         """
         return self._session.declare_subscriber(key, handler, allowed_origin=Locality.REMOTE)
 
     def _serve(self, key: str, handler: Any) -> Any:
-        """Begins to receive queries through Zenoh, except those of this connection itself.
+        """Starts receiving queries through Zenoh, excluding those sent by this connection.
 
         Args:
             key: Key of the queries.
-            handler: Handler of Zenoh that receives the queries.
+            handler: Zenoh handler that receives the queries.
         """
         return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
 
@@ -295,8 +297,8 @@ class ZenohBus:
 
         Args:
             key: The key, which may contain wildcards.
-            capacity: Number of messages that the queue holds. If it is full, the oldest message
-                is dropped.
+            capacity: Number of messages that the queue can hold. If it is full, the oldest
+                message is dropped.
         """
         return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)), _read_sample)
 
@@ -312,10 +314,10 @@ class ZenohBus:
         Args:
             key: Key under which the messages are published. It may contain wildcards.
             now_ns: Function that reads the local clock, in ns.
-            read: Function that decodes a payload, in a thread of Zenoh. It must not raise an
+            read: Function that decodes a payload in a thread of Zenoh. It must not raise an
                 error.
-            capacity: Number of messages that the queue holds. If it is full, the oldest message
-                is dropped.
+            capacity: Number of messages that the queue can hold. If it is full, the oldest
+                message is dropped.
         """
         ring = StampingRing(now_ns, read, capacity)
         receive = ring.receive  # looked up once, not for every message
@@ -324,7 +326,7 @@ class ZenohBus:
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls a function for each message under a key, at once and in a thread of Zenoh.
+        """Calls a function for each message under a key, immediately and in a thread of Zenoh.
 
         Args:
             key: The key, which may contain wildcards.
@@ -336,7 +338,7 @@ class ZenohBus:
     def query_inbox(self, key: str) -> QueryInbox:
         """Returns a queue of the queries that other members send under a key.
 
-        The caller removes the queries from the queue, and replies to them when it has time.
+        The caller polls the queue and replies when it has time.
 
         Args:
             key: The key, which may contain wildcards.
@@ -350,18 +352,18 @@ class ZenohBus:
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Replies to requests under a key at once, in a thread of Zenoh.
+        """Answers queries under a key immediately, in a thread of Zenoh.
 
         Args:
             key: Key of the queries, which may contain wildcards.
-            answer: Function that receives the payload of a query, and returns the payload of
-                the reply. If it returns None, there is no reply.
+            answer: Function that receives the payload of a query and returns the payload of the
+                reply. If it returns None, no reply is sent.
         """
 
         def answer_at_once(query: zenoh.Query) -> None:
-            """Replies to a query in the thread of Zenoh in which the query arrived.
+            """Answers a query in the thread of Zenoh in which it arrived.
 
-            There is no reply if `answer` returns None.
+            No reply is sent if `answer` returns None.
             """
             # A query ends for its sender only when the query object is dropped.
             with query:
@@ -374,11 +376,10 @@ class ZenohBus:
         )
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Sends a request to other processes, and returns a queue for their replies.
+        """Sends a query to other processes, and returns a queue for their replies.
 
         Args:
-            key: Key of the query. Every member (process of a session) that serves a matching
-                key replies.
+            key: Key of the query. Every member that serves a matching key replies.
             payload: Payload of the query.
         """
         # A ring channel is not used, because it loses its replies when the last reply has
@@ -400,28 +401,27 @@ class ZenohBus:
         )
 
     def announce(self, key: str) -> None:
-        """Shows other processes that this one is present, until its connection ends.
+        """Announces this process to the others until its connection ends.
 
         Args:
-            key: Key of the liveliness token by which other members see this member.
+            key: Key of the liveliness token through which other members see this member.
         """
         self._tokens.add(key)
         self._declarations.append(self._session.liveliness().declare_token(key))
 
     def presence(self, key: str) -> PresenceInbox:
-        """Returns a queue that tells which other members have appeared or disappeared.
+        """Returns a queue that reports which other members have appeared or disappeared.
 
-        An entry is the key of a liveliness token, by which a member (process of a session)
-        shows that it is present, and True if the token has appeared, or False if it has
-        disappeared. The first entries are the tokens that exist already. The tokens of this
-        session are left out.
+        An entry consists of the key of a member's liveliness token and a flag, which is True if
+        the token has appeared and False if it has disappeared. Tokens that already exist are
+        reported first. The tokens of this session are left out.
 
         Args:
             key: Key of the tokens, which may contain wildcards.
         """
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
-            """Reads from a Zenoh sample which process has appeared or disappeared.
+            """Determines from a Zenoh sample which process has appeared or disappeared.
 
             Returns:
                 The key of the token, and True if it has appeared. None for a token of this
@@ -439,20 +439,20 @@ class ZenohBus:
         return _ZenohRing(tokens, read)
 
     def close(self) -> None:
-        """Closes the network connection of Zenoh. Calling it again has no effect."""
+        """Closes the network connection of Zenoh. Repeated calls have no effect."""
         if not self._session.is_closed():
             self._session.close()
         self._declarations.clear()
 
 
 def read_zenoh_file(path: Path) -> ZenohFile:
-    """Reads a user's Zenoh configuration from a file in JSON5 or JSON, and checks it.
+    """Reads a user's Zenoh configuration from a JSON5 or JSON file, and checks it.
 
     Args:
         path: Path of the file.
 
     Returns:
-        The settings of the file, which suit a session.
+        The settings from the file, which are suitable for a session.
 
     Raises:
         UsageError: The file cannot be read, is not a Zenoh configuration, or contradicts the
@@ -467,17 +467,17 @@ def read_zenoh_file(path: Path) -> ZenohFile:
 
 
 def _parse_json5(source: str, text: str) -> object:
-    """Parses a JSON5 text with the parser of Zenoh.
+    """Parses JSON5 with the parser built into Zenoh.
 
-    Zenoh can only parse whole configurations. The text is therefore parsed as part of the key
-    `metadata` of a configuration, which may have any value.
+    Zenoh can only parse complete configurations. The text is therefore embedded in a
+    configuration under the key `metadata`, which may have any value.
 
     Args:
         source: Name of the file, for error messages.
         text: Content of the file.
 
     Returns:
-        The object, which is a dict if the text is a configuration.
+        The parsed object, which is a dict if the text is a configuration.
 
     Raises:
         UsageError: The text is not JSON5, is nested too deeply, or contains several objects.
@@ -511,7 +511,7 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns the reason why Zenoh refuses a configuration, or "" if Zenoh accepts it.
+    """Returns Zenoh's reason for rejecting a configuration, or an empty string if it is valid.
 
     Args:
         settings: The configuration, or a part of it.
@@ -524,7 +524,7 @@ def _find_refusal(settings: Mapping[str, Any]) -> str:
 
 
 def _first_line(error: zenoh.ZError) -> str:
-    """Returns the first line of a Zenoh error, as the reason in a message to the user.
+    """Returns the first line of a Zenoh error, for use as the reason in a message to the user.
 
     The position in Zenoh's source code is removed, and a very long line is cut after 400
     characters.
@@ -533,5 +533,5 @@ def _first_line(error: zenoh.ZError) -> str:
 
 
 def _endpoint_texts(endpoints: Sequence[Endpoint]) -> str:
-    """Returns endpoints as one text for messages: "tcp/127.0.0.1:7447, tcp/10.0.0.2:7447"."""
+    """Joins endpoints into one string for messages: "tcp/127.0.0.1:7447, tcp/10.0.0.2:7447"."""
     return ", ".join(map(str, endpoints))

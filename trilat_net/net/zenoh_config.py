@@ -1,30 +1,28 @@
-"""Composes the Zenoh configuration of a member, and checks the Zenoh file of a user.
+"""Composes the Zenoh configuration of a member, and checks the user's Zenoh file.
 
-Zenoh is the library that transports the messages. A member is a process that takes part in a
-session. Its Zenoh settings differ from Zenoh's defaults in three points that matter for a
-control loop at 1 kHz:
+Zenoh is the library that transports the messages. The settings of a member differ from Zenoh's
+defaults in three points that matter for a control loop at 1 kHz:
 
-- The transmission queue holds 16 batches instead of 2. A loop that was late sends the messages
-  of several ticks in one burst.
-- A publisher does not wait for room in the queue (the default is 1 ms), because the loop must
-  not wait. Receivers count the messages that are dropped.
+- The transmission queue holds 16 batches instead of 2, because a loop that is late sends the
+  messages of several ticks in one burst.
+- A publisher does not wait for space in the queue (1 ms by default), because the loop must not
+  wait. Receivers count the dropped messages.
 - The option `express`, which sends each message separately, stays off. Bursts of thousands of
-  small messages fit into the queue only in batches.
+  small messages only fit into the queue as batches.
 
-With keys, Zenoh's access control limits what each kind of member may do: which messages it may
-publish, receive, query and answer. A router forwards the messages of others, and is therefore
-permitted to do everything. The size of messages is limited as well, but not their rate: a rate
-limit of Zenoh would drop messages of a burst.
+With keys, Zenoh's access control restricts which messages each kind of member may publish,
+receive, query and answer. A router forwards messages for others, and is therefore allowed to do
+everything. The size of messages is limited too, but not their rate, since Zenoh's rate limit
+would drop messages in a burst.
 
 Invariant:
-    - Members connect only to endpoints that are named explicitly, so that two sessions on one
+    - Members only connect to endpoints that are named explicitly, so two sessions on one
       machine never connect by accident. Zenoh's automatic discovery (multicast and gossip) is
       off.
-    - No setting in a user's file is overruled silently. It is accepted, or the file is refused
-      with a message that lists all settings that do not suit a session, and the required
-      values.
-    - With keys, everything that is not permitted explicitly is denied. A member can publish
-      only under its own name, because its connections show a certificate with that name.
+    - No setting in a user's file is silently overridden. Either the file is accepted, or it is
+      rejected with a message that lists all unsuitable settings and the required values.
+    - With keys, everything that is not explicitly allowed is denied. A member can only publish
+      under its own name, because its connections present a certificate with that name.
 """
 
 import json
@@ -39,27 +37,27 @@ from ..files import open_regular
 from . import topics
 
 LEASE_MS = 5_000
-"""Time without a sign of life after which Zenoh closes a connection, in ms.
+"""Time with no sign of life after which Zenoh closes a connection, in ms.
 
-A member may be suspended for a shorter time without losing the connection and messages. A
-member that is killed is noticed at once, because its connection is closed, and a silent member
-is noticed by the age of its samples.
+A member may be suspended for less than this time without losing the connection or any messages.
+A member that is killed is noticed immediately because its connection is closed, and a silent
+member is noticed from the age of its samples.
 """
 
 BATCHES = 16
-"""Number of batches that a transmission queue holds."""
+"""Number of batches that a transmission queue can hold."""
 _BATCH_BYTES = 65_535
 """Size of a batch, in bytes."""
 MOST_PUT_BYTES = 262_144
-"""Largest published message that is accepted, in bytes.
+"""Maximum size of an accepted published message, in bytes.
 
-It holds ten records of the longest arms.
+This is enough for ten records of the longest arms.
 """
 _MOST_QUERY_BYTES = 65_536
-"""Largest query that is accepted, in bytes."""
+"""Maximum size of an accepted query, in bytes."""
 
 ZenohMode = Literal["peer", "client", "router"]
-"""Whether a process connects to other members, connects to a router, or is a router."""
+"""Whether a process connects to other members, connects to a router, or acts as a router."""
 Endpoint = str | Mapping[str, Any]
 """An address such as "tcp/127.0.0.1:7447", or a group of addresses in Zenoh's format."""
 
@@ -73,32 +71,32 @@ _QUEUES = [
     "data_low",
     "background",
 ]
-"""Names of Zenoh's transmission queues of a connection, by priority."""
+"""Names of the transmission queues of a Zenoh connection, in order of priority."""
 
 _CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
-"""Zenoh's setting `connect/timeout_ms` by mode: -1 retries without limit, 0 does not retry.
+"""Zenoh's setting `connect/timeout_ms` for each mode: -1 retries without limit, 0 does not
+retry.
 
-A client cannot open its session without its router. `Connection.open_bus` tries again until the
-router runs.
+A client cannot open its session without its router. `Connection.open_bus` retries until the
+router is running.
 """
 _CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
-"""Zenoh's setting `connect/exit_on_failure` by mode."""
+"""Zenoh's setting `connect/exit_on_failure` for each mode."""
 _LISTEN_TIMEOUT_MS = {"router": 0, "peer": 0, "client": 0}
-"""Zenoh's setting `listen/timeout_ms` by mode. These are the defaults of Zenoh."""
+"""Zenoh's setting `listen/timeout_ms` for each mode. These are Zenoh's defaults."""
 _LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
-"""Zenoh's setting `listen/exit_on_failure` by mode. These are the defaults of Zenoh."""
+"""Zenoh's setting `listen/exit_on_failure` for each mode. These are Zenoh's defaults."""
 
 
 def _limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
-    """Returns a Zenoh filter that drops incoming messages above a size.
+    """Returns a Zenoh filter that drops incoming messages above a certain size.
 
-    Without the filter, another program could occupy the memory of a member (process of a
-    session) with huge messages.
+    Otherwise, another program could fill the memory of a member with huge messages.
 
     Args:
         name: Name of the filter.
-        messages: Kinds of messages, in the words of Zenoh, to which the limit applies.
-        size: Largest permitted size, in bytes.
+        messages: Kinds of messages to which the limit applies, in Zenoh's terms.
+        size: Maximum size, in bytes.
     """
     return {
         "id": name,
@@ -125,7 +123,7 @@ def make_zenoh_config(
     """Returns the complete Zenoh configuration for one process of a session.
 
     Args:
-        listen: Endpoints at which the member listens.
+        listen: Endpoints on which the member listens.
         connect: Endpoints to which the member connects.
         mode: Mode of the member: "peer", "client" or "router".
         user_settings: Settings that take precedence, from a user's file (`ZenohFile.settings`)
@@ -164,10 +162,10 @@ def make_zenoh_config(
 
 
 def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested settings in which some values are replaced, for example by a user's file.
+    """Merges nested settings, with overrides taking precedence over the base settings.
 
     Args:
-        base: The settings.
+        base: The base settings.
         overrides: Values that replace those of `base`, at any level. Settings that appear only
             in `base` are kept.
     """
@@ -182,24 +180,21 @@ def merge_settings(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dic
 
 
 _Requirement = tuple[Callable[[Any], bool], str]
-"""Requirement for a value: a function that checks the value, and a text for errors.
-"""
+"""Requirement for a value: a function that checks the value, and an error message."""
 
 
 def _require_value(required: object, text: str) -> _Requirement:
-    """Returns a check that a Zenoh setting of a user has a certain value and type.
-
-    A session works only with these settings.
+    """Returns the requirement that a user's Zenoh setting has a certain value and type.
 
     Args:
         required: The required value.
-        text: The required value and the reason, as the error message states them.
+        text: The required value and the reason, as stated in the error message.
     """
 
     def is_required_value(value: Any) -> bool:
-        """Returns True if a setting of Zenoh has the required value, and the same type.
+        """Returns True if a Zenoh setting has the required value and type.
 
-        The type matters, because 0 == False in Python.
+        The type is compared because 0 == False in Python.
         """
         return value == required and isinstance(value, type(required))
 
@@ -207,11 +202,11 @@ def _require_value(required: object, text: str) -> _Requirement:
 
 
 def _require_minimum(minimum: int, text: str) -> _Requirement:
-    """Returns the requirement that a setting must be an integer not below a minimum.
+    """Returns the requirement that a setting is an integer not below a minimum.
 
     Args:
-        minimum: The smallest permitted value.
-        text: The required value and the reason, as the error message states them.
+        minimum: The smallest allowed value.
+        text: The required value and the reason, as stated in the error message.
     """
 
     def is_large_enough(value: Any) -> bool:
@@ -224,15 +219,14 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     """Returns the requirement for a key that the session sets itself, depending on the mode.
 
     Args:
-        session_values: Values that the session sets, by mode. The checked value is a dictionary
-            by mode as well, see `_expand_mode`.
+        session_values: Mapping from mode to the value set by the session. The checked value is
+            such a mapping too, see `_expand_mode`.
     """
 
     def equals_session_value(mode: str, value: Any) -> bool:
-        """Returns True if a user's value for one mode of Zenoh is the one that a session uses.
+        """Returns True if a user's value for one Zenoh mode is the one that a session uses.
 
-        The type must be the same, too. The result is False for a mode in which a session sets
-        no value.
+        The types must be equal too. False for a mode in which a session sets no value.
         """
         if mode not in session_values:
             return False
@@ -241,9 +235,9 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
         return is_equal and type(value) is type(session_value)
 
     def are_session_values(values: Any) -> bool:
-        """Returns True if a setting that depends on Zenoh's mode agrees with the session.
+        """Returns True if a mode-dependent Zenoh setting agrees with the session's values.
 
-        A mode is "peer", "client" or "router".
+        The modes are "peer", "client" and "router".
         """
         if not isinstance(values, dict):
             return False
@@ -298,23 +292,23 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
         "left out: a session sets it",
     ),
 }
-"""Requirements of a session, by the path of the key in Zenoh's configuration."""
+"""Requirements of a session, keyed by path in Zenoh's configuration."""
 
 _FILE_KEYS = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dictionary_file)"
-"""Pattern of the keys whose values are names of files.
+"""Pattern of the keys whose values are file names.
 
-These files are opened during the check, to report unreadable files early. Zenoh opens them only
-when it connects, and then tries again forever.
+The check opens these files to report unreadable ones early. Zenoh opens them only when it
+connects, and then retries forever.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """Settings of a user's Zenoh file, after they were checked.
+    """Checked settings from a user's Zenoh file.
 
     Attributes:
         source: Name of the file, for error messages.
-        mode: Mode in the file. Empty if the file has none.
+        mode: Mode given in the file. Empty if the file gives none.
         settings: All settings except the mode and the endpoints.
     """
 
@@ -326,15 +320,15 @@ class ZenohFile:
     def endpoints(
         self, side: Literal["listen", "connect"], mode: ZenohMode
     ) -> list[Endpoint] | None:
-        """Returns the network addresses that a user's Zenoh file names for one direction.
+        """Returns the endpoints that the Zenoh file names for listening or for connecting.
 
         Args:
-            side: "listen" for the endpoints at which the member (process of a session) listens,
-                or "connect" for those to which it connects.
+            side: "listen" for the endpoints on which the member listens, or "connect" for those
+                to which it connects.
             mode: Mode of the member. The file may name different endpoints for each mode.
 
         Returns:
-            The endpoints. None if the file names none.
+            The endpoints, or None if the file names none.
         """
         endpoints = self._endpoints.get(side)
         # A dictionary is either a group of locators or a table by mode.
@@ -348,20 +342,20 @@ class ZenohFile:
     def check(
         cls, source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
     ) -> "ZenohFile":
-        """Checks a user's file of Zenoh settings, because a session needs some fixed values.
+        """Checks that a user's Zenoh settings meet the requirements of a session.
 
         Args:
             source: Name of the file, for error messages.
             stated: Parsed content of the file.
-            refusal: Function that returns Zenoh's reason for refusing settings, or an empty
-                text if Zenoh accepts them.
+            refusal: Function that returns Zenoh's reason for rejecting settings, or an empty
+                string if Zenoh accepts them.
 
         Returns:
-            The content.
+            The checked content.
 
         Raises:
             UsageError: The file is not a Zenoh configuration, or contradicts the requirements
-                of a session. The message lists all keys with such contradictions.
+                of a session. The message lists all contradicting keys.
         """
         if not isinstance(stated, dict):
             raise UsageError(
@@ -393,11 +387,11 @@ class ZenohFile:
 
 
 def _list_problems(source: str, problems: Sequence[str]) -> str:
-    """Returns an error message with all problems of a user's Zenoh file, in one line.
+    """Returns a one-line error message with all problems of a user's Zenoh file.
 
     Args:
         source: Name of the file.
-        problems: A string for each problem, at least one.
+        problems: One string per problem, at least one.
     """
     if len(problems) == 1:
         return f"{source}: {problems[0]}"
@@ -406,13 +400,13 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
 
 
 def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Finds the settings of a user's Zenoh file with which a session would not work.
+    """Finds settings in a user's Zenoh file with which a session would not work.
 
     Args:
         settings: Content of the file.
 
     Yields:
-        A string for each problem, which begins with the key.
+        One string per problem, which begins with the key.
     """
     for key, value in _iterate_leaves(settings, ()):
         checked_value = _expand_mode(settings, value) if key in _SET_BY_MODE else value
@@ -437,14 +431,14 @@ _SET_BY_MODE = (
     "listen/timeout_ms",
     "listen/exit_on_failure",
 )
-"""Keys that a session sets itself, depending on the mode of the member."""
+"""Keys that are set by a session itself, depending on the mode of the member."""
 
 
 def _expand_mode(settings: Mapping[str, Any], value: Any) -> Any:
-    """Returns the value of a key as a dictionary by mode.
+    """Returns the value of a key as a dictionary keyed by mode.
 
-    A value that is not a dictionary applies to the mode in the file, or to peers if the file
-    has no mode.
+    A value that is not a dictionary applies to the mode given in the file, or to peers if the
+    file gives no mode.
 
     Args:
         settings: Content of the file.
@@ -457,7 +451,7 @@ def _drop_key(settings: dict[str, Any], path: str) -> None:
     """Removes a key such as "transport/unicast" from nested settings, if it is present.
 
     Args:
-        settings: The settings. They are changed in place.
+        settings: The settings, which are modified in place.
         path: Keys of the levels, separated by "/".
     """
     *folders, last = path.split("/")
@@ -467,9 +461,10 @@ def _drop_key(settings: dict[str, Any], path: str) -> None:
 
 
 def _remove_nulls(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a copy of nested settings without the keys whose value is null.
+    """Returns a copy of nested settings, excluding keys whose value is null.
 
-    A key with the value null sets nothing, so it must not be checked as a choice of the user.
+    A key with the value null sets nothing, so it must not be checked as if the user had chosen
+    it.
     """
     return {
         key: _remove_nulls(value) if isinstance(value, dict) else value
@@ -481,9 +476,9 @@ def _remove_nulls(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _iterate_leaves(
     settings: Mapping[str, Any], path: tuple[str, ...]
 ) -> Iterator[tuple[str, Any]]:
-    """Yields the path and the value of each setting in nested settings.
+    """Yields the path and value of each setting in nested settings.
 
-    If there is a requirement for a group of settings, the group is yielded as a whole.
+    If there is a requirement for a group of settings, the group is yielded as one entry.
 
     Args:
         settings: Settings below `path`.
@@ -503,16 +498,17 @@ def _find_refused_keys(
     refusal: Callable[[Mapping[str, Any]], str],
     path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Finds the settings that Zenoh refuses, by trying each setting alone.
+    """Finds the settings that Zenoh rejects, by trying each one separately.
 
     Args:
         settings: Settings below `path`.
-        refusal: Function that returns Zenoh's reason for refusing settings, or an empty text.
+        refusal: Function that returns Zenoh's reason for rejecting settings, or an empty
+            string.
         path: Keys of the levels above.
 
     Yields:
-        The path and the reason of each refused setting. If a group of settings is refused,
-        these are the refused settings within the group.
+        The path of each rejected setting, and the reason. If a group of settings is rejected,
+        the rejected settings within the group are yielded.
     """
     for key, value in settings.items():
         key_path = (*path, key)
@@ -529,11 +525,11 @@ def _find_refused_keys(
 
 
 def _suggest_key(path: Sequence[str], reason: str) -> str:
-    """Returns why a Zenoh setting is refused, with a similar name for an unknown one.
+    """Explains why a Zenoh setting is rejected, suggesting a similar name for an unknown one.
 
     Args:
         path: Path of the key.
-        reason: Reason of Zenoh.
+        reason: Zenoh's reason.
     """
     unknown_field = re.match(r"unknown field `([^`]*)`, expected (?:one of )?(.*)", reason)
     if unknown_field is None or not path or unknown_field[1] != path[-1]:
@@ -550,18 +546,18 @@ OPERATOR = "operator"
 ROUTER = "router"
 BRIDGE = "bridge"
 PROTOCOLS = ("tls", "quic")
-"""Protocols that are permitted with keys."""
+"""Protocols that are allowed with keys."""
 
 _MOST_REPLY_BYTES = 8_388_608
-"""Largest reply that is accepted, in bytes: a reply with records that are sent again."""
+"""Maximum size of an accepted reply, in bytes, which is that of a reply with resent records."""
 MOST_SESSIONS = 64
-"""Largest number of connections of a member with keys."""
+"""Maximum number of connections of a member with keys."""
 
 
 class _Role(NamedTuple):
-    """The channels that a kind of member (process of a session) may use.
+    """The channels that one kind of member may use.
 
-    A channel is a kind of messages, see `topics`.
+    A channel is a kind of message, see `topics`.
 
     Attributes:
         receives: Channels that the member receives from all members.
@@ -620,7 +616,7 @@ ROLES = {
         publishes_to=(topics.HAND, topics.MEASURED),
     ),
 }
-"""Roles of the members that are not sites, by their names."""
+"""Mapping from the name of each member that is not a site to its role."""
 _CHANNEL_WORDS = {
     topics.SAMPLE: "samples",
     topics.STATE: "records",
@@ -638,13 +634,13 @@ _CHANNEL_WORDS = {
 
 
 def describe_role(member: str) -> list[str]:
-    """Describes for the user what a member with keys may send, one line per kind of receiver.
+    """Describes what a member with keys may send, with one line per kind of receiver.
 
-    A member is a process of a session. Replies, queries for information and signs of presence
-    are left out, because every member may send them.
+    Replies, queries for information and liveliness tokens are left out, because every member
+    may send them.
 
     Args:
-        member: Name of the member. It determines the role.
+        member: Name of the member, which determines its role.
     """
     if member == ROUTER:
         return ["forwards the messages of all members, whatever they contain"]
@@ -667,11 +663,11 @@ def describe_role(member: str) -> list[str]:
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
     """Returns the Zenoh settings that let each member send only what its role requires.
 
-    A member (process of a session) proves its role by the name in its certificate.
+    A member proves its role through the name in its certificate.
 
     Args:
-        members: Names of all members of the session. Members other than the recorder, the
-            operator and the router are sites (arm controllers).
+        members: Names of all members of the session. All members other than the recorder, the
+            operator and the router are sites.
     """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -707,7 +703,7 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
 
 
 _LIVELINESS = "liveliness_token", "declare_liveliness_subscriber", "liveliness_query"
-"""Kinds of messages about which members are present."""
+"""Kinds of messages that show which members are present."""
 _ALL_MESSAGES = (
     "put",
     "delete",
@@ -723,8 +719,8 @@ _ALL_MESSAGES = (
 def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     """Derives the access rules of a member from its role.
 
-    Zenoh checks the rules at the other end of a connection: "ingress" concerns messages that
-    arrive from the member, "egress" messages that are sent to it.
+    Zenoh checks the rules at the other end of a connection: "ingress" applies to messages that
+    arrive from the member, and "egress" to messages sent to it.
 
     Args:
         member: Name of the member.
@@ -732,10 +728,9 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     """
 
     def keys(owner: str, channels: Sequence[str]) -> list[str]:
-        """Returns the keys under which a member publishes messages, for some of its channels.
+        """Returns the keys under which a member publishes on the given channels.
 
-        A member is a process that takes part in a session, and a channel is a kind of message.
-        The keys apply to any session.
+        The keys match any session.
 
         Args:
             owner: Name of the member. "*" stands for any member.
@@ -768,11 +763,11 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
 
 
 def _make_rule(flows: list[str], messages: Sequence[str], keys: list[str]) -> dict[str, Any]:
-    """Returns a rule of Zenoh's access control that permits some messages.
+    """Returns a rule of Zenoh's access control that allows certain messages.
 
     Args:
         flows: Directions: "ingress" for messages from the member, "egress" for those to it.
-        messages: Kinds of messages, in Zenoh's words.
+        messages: Kinds of messages, in Zenoh's terms.
         keys: Keys of the messages.
     """
     return {"flows": flows, "messages": list(messages), "key_exprs": keys}

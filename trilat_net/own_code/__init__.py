@@ -22,10 +22,10 @@ from ..hooks import import_on_use
 __all__ = [
     # Permissions
     "LawFiles",
+    "LoggedUserLaw",
     "allow_logged_code",
     "allow_own_code",
-    "find_user_laws",
-    "list_imported_code",
+    "list_named_code",
     # Import
     "CLASS_PATTERN",
     "CodeConsents",
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
     from .class_arguments import make_own_instance
     from .code_consent import (
         LawFiles,
+        LoggedUserLaw,
         allow_logged_code,
         allow_own_code,
-        find_user_laws,
         import_named_class,
-        list_imported_code,
+        list_named_code,
     )
     from .imported_code import (
         CLASS_PATTERN,
@@ -75,8 +75,8 @@ else:
         {
             "class_arguments": "make_own_instance",
             "code_consent": (
-                "LawFiles allow_logged_code allow_own_code find_user_laws "
-                "import_named_class list_imported_code"
+                "LawFiles LoggedUserLaw allow_logged_code allow_own_code import_named_class "
+                "list_named_code"
             ),
             "imported_code": (
                 "CLASS_PATTERN CodeConsents CodeKey ImportedLaw Watch allowed_code "

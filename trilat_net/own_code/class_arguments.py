@@ -4,8 +4,10 @@ The class is a control law, a hand (a program that moves an arm) or a plant (a m
 Its arguments are the keys that the user wrote next to its name. An argument that the class does
 not have, or whose value has the wrong type, is rejected before any code of the class runs. The
 error names the class, its file, the argument, and the arguments that the class accepts.
+`list_default_arguments` reads the values of arguments that a scenario leaves out.
 """
 
+import ast
 import inspect
 from collections.abc import Mapping
 from typing import Any
@@ -42,7 +44,7 @@ def make_own_instance(
         ScenarioError: An argument is unknown, missing or of the wrong type, or the class raised
             any exception.
     """
-    check_arguments(kind, code, settings, path)
+    _check_arguments(kind, code, settings, path)
     has_init = kind.__init__ is not object.__init__
     has_new = kind.__new__ is not object.__new__
     takes_arguments = has_init or has_new
@@ -57,7 +59,7 @@ def make_own_instance(
         raise ScenarioError(problem, path=path) from None
 
 
-def check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
+def _check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
     """Raises ScenarioError if a user's class does not accept its arguments in the scenario.
 
     The arguments are compared with the constructor of the class before an instance is created,
@@ -142,3 +144,55 @@ def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: st
             f"{subject}: its argument {parameter.name} must be {name}, but is {value!r}",
             path=path,
         )
+
+
+def list_default_arguments(content: bytes, name: str) -> dict[str, Any]:
+    """Returns the default values of a user's class's arguments, without running its file.
+
+    A default that is not a literal is returned as its Python source text.
+
+    Args:
+        content: Content of the Python file.
+        name: Name of the class.
+
+    Returns:
+        Maps the name of each argument to its default. Empty if the file does not define the
+        arguments.
+    """
+    tree = ast.parse(content)
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    law_class = classes.get(name)
+    while law_class is not None:
+        for member in law_class.body:
+            if isinstance(member, ast.FunctionDef) and member.name == "__init__":
+                return _list_defaults(member.args)
+        # The class may have the arguments of a base class, which stands before it in the file.
+        bases = [base.id for base in law_class.bases if isinstance(base, ast.Name)]
+        law_class = classes.pop(bases[0], None) if bases else None
+    return {}
+
+
+def _list_defaults(arguments: ast.arguments) -> dict[str, Any]:
+    """Maps the name of each argument of a Python function to its default value.
+
+    Args:
+        arguments: The arguments, as returned by Python's parser.
+    """
+    positional = [*arguments.posonlyargs, *arguments.args]
+    # Only the last of the positional arguments have defaults.
+    first = len(positional) - len(arguments.defaults)
+
+    pairs = [
+        *zip(positional[first:], arguments.defaults, strict=True),
+        *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True),
+    ]
+
+    defaults = {}
+    for argument, value in pairs:
+        if value is None:  # an argument without a default
+            continue
+        try:
+            defaults[argument.arg] = ast.literal_eval(value)
+        except ValueError:
+            defaults[argument.arg] = ast.unparse(value)
+    return defaults

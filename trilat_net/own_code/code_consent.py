@@ -17,7 +17,7 @@ Invariant:
 import json
 import os
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -34,7 +34,6 @@ from .imported_code import (
     NamedCode,
     ScenarioWithCode,
     allowed_code,
-    check_class,
     describe_setting,
     read_code,
     remembered_settings,
@@ -45,25 +44,14 @@ LawFiles = str | Path | Sequence[str | Path]
 """Path of a file with user-written code, or several such paths."""
 
 
-def list_imported_code(scenarios: Iterable[ScenarioWithCode]) -> list[tuple[str, str]]:
-    """Returns the user-written Python classes that would run in the given scenarios.
-
-    Args:
-        scenarios: The scenarios.
-
-    Returns:
-        The distinct classes, each as its name, such as "mylaws:Spring", and the SHA-256 hash of
-        its file.
-    """
-    named = [code for scenario in scenarios for code in _list_named_code(scenario)]
-    return list(dict.fromkeys((code.code, code.source_sha256) for code in named))
-
-
-def _list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
+def list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
     """Returns the entries of a scenario that name a user's class.
 
     These are control laws, operators (programs that move an arm) and plants (programs that
     compute the motion of an arm).
+
+    Args:
+        scenario: The scenario.
     """
     named: list[NamedCode] = []
     for site in scenario.sites.values():
@@ -109,12 +97,12 @@ def allow_own_code(
     """
     earlier_consents: dict[tuple[str, str], CodeConsent] = {}
     if changed_from is not None:
-        for key in map(CodeKey.of, _list_named_code(changed_from)):
+        for key in map(CodeKey.of, list_named_code(changed_from)):
             consent = key.find_consent()
             if consent is not None:
                 earlier_consents[key.code, key.sha256] = consent
 
-    for key in map(CodeKey.of, _list_named_code(scenario)):
+    for key in map(CodeKey.of, list_named_code(scenario)):
         earlier_consent = earlier_consents.get((key.code, key.sha256))
         if codes is None or key.code in codes:
             allowed_code[key] = CodeConsent(None, key.sha256)
@@ -178,7 +166,7 @@ def allow_logged_code(
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
     if (other_version or remember) and not files:
         raise UsageError("--other-version and --remember need a file: give --law FILE, too")
-    logged = {CodeKey.of(imported): imported for imported in _list_named_code(scenario)}
+    logged = {CodeKey.of(imported): imported for imported in list_named_code(scenario)}
 
     # If the log names no user's code, the store is not read.
     remembered = _read_store() if logged else {}
@@ -296,7 +284,7 @@ def _allow_file(
             versions = _compare_hashes(key, sha256)
             problem = f"is not the file that ran as {key.code}: {versions}"
             raise UsageError(f"--law {file} {problem}; --other-version accepts it")
-        check_class(source, key.code, "--law", logged[key].method)
+        source.check_class(key.code, "--law", logged[key].method)
         allowed_code[key] = CodeConsent(source.file, sha256)
     return sha256, keys
 
@@ -309,7 +297,7 @@ def _compare_hashes(key: CodeKey, sha256: str) -> str:
     return f"its sha256 is {sha256[:16]}, but was {key.sha256[:16]}"
 
 
-class _LoggedUserLaw(NamedTuple):
+class LoggedUserLaw(NamedTuple):
     """User-written control law that a log names, with its permission to run.
 
     Attributes:
@@ -333,6 +321,43 @@ class _LoggedUserLaw(NamedTuple):
     changed: str
     other_settings: str = ""
 
+    @classmethod
+    def inspect(cls, law: ImportedLaw, sites: tuple[str, ...]) -> "LoggedUserLaw":
+        """Finds the file of a user's control law, and whether the law may run.
+
+        None of its code is run.
+
+        Args:
+            law: The law in the scenario.
+            sites: Names of the sites that it controls.
+        """
+        key = CodeKey.of(law)
+        consent = key.find_consent()
+        sha256 = ""
+        file = None
+        with suppress(ScenarioError):
+            source = read_code(key.code, "", consent and consent.file)
+            source.check_class(key.code, "")
+            sha256 = source.sha256
+            file = source.file
+
+        is_allowed = consent is not None and consent.sha256 == sha256
+        # The hash is empty if there is no file.
+        is_changed = sha256 not in ("", key.sha256)
+        settings = ", ".join(
+            f"{argument} = {describe_setting(value)}"
+            for argument, value in law.settings.items()
+        )
+        return cls(
+            code=key.code,
+            sites=sites,
+            settings=settings,
+            allowed=is_allowed,
+            file=file,
+            changed=_compare_hashes(key, sha256) if is_changed else "",
+            other_settings="" if is_allowed else key.describe_new_settings(),
+        )
+
     def __str__(self) -> str:
         """Returns a sentence about the control law, with the option that permits it to run."""
         law = f"{self.code} of {', '.join(self.sites)}"
@@ -350,57 +375,3 @@ class _LoggedUserLaw(NamedTuple):
         difference = f" ({self.other_settings})" if self.other_settings else ""
         problem = f"{law} is external code, which may not run{settings}{difference}"
         return f"{problem}; if you trust it: --law {option}"
-
-
-def find_user_laws(scenario: ScenarioWithCode) -> list[_LoggedUserLaw]:
-    """Returns the control laws of a scenario that are user-written classes.
-
-    No user code runs. Each entry states whether the law may run, and which file would be used.
-
-    Args:
-        scenario: Scenario of a log.
-    """
-    sites: dict[CodeKey, tuple[str, ...]] = {}
-    laws: dict[CodeKey, ImportedLaw] = {}
-    for name, settings in scenario.sites.items():
-        if isinstance(settings.control, ImportedLaw):
-            key = CodeKey.of(settings.control)
-            sites[key] = (*sites.get(key, ()), name)
-            laws[key] = settings.control
-    return [_inspect_user_law(key, law, sites[key]) for key, law in laws.items()]
-
-
-def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> _LoggedUserLaw:
-    """Finds the file of a user's control law, and whether the law may run.
-
-    None of its code is run.
-
-    Args:
-        key: Class, hash and arguments.
-        law: The law in the scenario.
-        sites: Names of the sites that it controls.
-    """
-    consent = key.find_consent()
-    sha256 = ""
-    file = None
-    with suppress(ScenarioError):
-        source = read_code(key.code, "", consent and consent.file)
-        check_class(source, key.code, "")
-        sha256 = source.sha256
-        file = source.file
-
-    is_allowed = consent is not None and consent.sha256 == sha256
-    # The hash is empty if there is no file.
-    is_changed = sha256 not in ("", key.sha256)
-    settings = ", ".join(
-        f"{argument} = {describe_setting(value)}" for argument, value in law.settings.items()
-    )
-    return _LoggedUserLaw(
-        code=key.code,
-        sites=sites,
-        settings=settings,
-        allowed=is_allowed,
-        file=file,
-        changed=_compare_hashes(key, sha256) if is_changed else "",
-        other_settings="" if is_allowed else key.describe_new_settings(),
-    )

@@ -35,7 +35,7 @@ from ..core import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
 from ..files import find_page, open_regular
 from ..laws import LawSettings, SentVectorSpecs, convert_sends
-from .class_arguments import make_own_instance
+from .class_arguments import list_default_arguments, make_own_instance
 from .sent_channel import parse_classes
 
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
@@ -239,7 +239,7 @@ class CodeKey(NamedTuple):
                 f"the file, or write {code!r} in the scenario again to use the present file",
                 path=path,
             )
-        check_class(source, code, path, method)
+        source.check_class(code, path, method)
 
         search_folder = None
         if consent.file is not None:
@@ -367,6 +367,25 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     settings: dict[str, Any] = field(default_factory=dict)
     sends: SentVectorSpecs = field(default_factory=dict)
 
+    def read_default_settings(self) -> dict[str, Any]:
+        """Returns the defaults of the class's arguments, which apply if the scenario omits
+        them.
+
+        They are read from the file of the law, which is not run. A default that is not a
+        literal is returned as its Python source text.
+
+        Returns:
+            Maps the name of each argument to its default. Empty if the file is missing, has
+            changed since the scenario was made, or does not define the arguments.
+        """
+        try:
+            source = read_code(self.code, "control.law")
+        except ScenarioError:
+            return {}
+        if source.sha256 != self.source_sha256:
+            return {}
+        return list_default_arguments(source.content, self.code.partition(":")[2])
+
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
         """Returns a function that creates the control law for a site.
 
@@ -413,6 +432,40 @@ class _CodeSource(NamedTuple):
     file: Path
     content: bytes
     sha256: str
+
+    def check_class(self, code: str, path: str, method: str = "torque") -> None:
+        """Raises ScenarioError unless the file defines a given class with a given method.
+
+        The file is parsed but not run, because the code may not have been permitted yet.
+
+        Args:
+            code: Module and class, for example "package.module:Law".
+            path: Path of the key in the scenario, for error messages.
+            method: Method that the class must have.
+
+        Raises:
+            ScenarioError: The file is not valid Python, has no such class, or the class has
+                neither the method nor a base class or decorator that may add it.
+        """
+        kind, page = PAGES[method]
+        name = code.partition(":")[2]
+        classes = parse_classes(self.content, self.file, path)
+        if name not in classes:
+            hint = suggest_nearest(name, list(classes)) or f"; see {find_page(page)}"
+            raise ScenarioError(f"{self.file} defines no class {name}{hint}", path=path)
+        class_node = classes[name]
+        used_names = {
+            getattr(syntax_node, "name", getattr(syntax_node, "id", ""))
+            for syntax_node in ast.walk(class_node)
+        }
+        may_inherit_method = (
+            class_node.bases or class_node.keywords or class_node.decorator_list
+        )
+        if not may_inherit_method and method not in used_names:
+            raise ScenarioError(
+                f"{code} is not a {kind}: the class has no {method}; see {find_page(page)}",
+                path=path,
+            )
 
 
 def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
@@ -520,40 +573,6 @@ PAGES = {
 """Maps each required method to the name of the kind of class that has it, and its documentation
 page.
 """
-
-
-def check_class(source: _CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Raises ScenarioError unless a Python file defines a given class with a given method.
-
-    The file is parsed but not run, because the code may not have been permitted yet.
-
-    Args:
-        source: The file, as read from disk.
-        code: Module and class, for example "package.module:Law".
-        path: Path of the key in the scenario, for error messages.
-        method: Method that the class must have.
-
-    Raises:
-        ScenarioError: The file is not valid Python, has no such class, or the class has neither
-            the method nor a base class or decorator that may add it.
-    """
-    kind, page = PAGES[method]
-    name = code.partition(":")[2]
-    classes = parse_classes(source.content, source.file, path)
-    if name not in classes:
-        hint = suggest_nearest(name, list(classes)) or f"; see {find_page(page)}"
-        raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
-    class_node = classes[name]
-    used_names = {
-        getattr(syntax_node, "name", getattr(syntax_node, "id", ""))
-        for syntax_node in ast.walk(class_node)
-    }
-    may_inherit_method = class_node.bases or class_node.keywords or class_node.decorator_list
-    if not may_inherit_method and method not in used_names:
-        raise ScenarioError(
-            f"{code} is not a {kind}: the class has no {method}; see {find_page(page)}",
-            path=path,
-        )
 
 
 def _import(module: str, sha256: str) -> Any:

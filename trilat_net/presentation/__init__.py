@@ -1,11 +1,12 @@
-"""Presents the results of runs as figures, as a web page, as text and as files for other tools.
+"""Presents the results of runs as figures, web pages, text, and files for other tools.
 
-The package `analysis` computes the results. This package draws and writes them, for example the
-report of a run (`page`), or the text of `trilat certify` (`certificate_text`).
+The package `analysis` computes the results; this package draws and writes them. For example,
+`page` writes the report of a run, and `certificate_text` composes the output of `trilat
+certify`.
 
 Invariant:
-    - Matplotlib is imported only in this package and in the figures of `studies`, so that
-      programs that draw nothing start fast.
+    - Matplotlib is imported only here and in the figures of `studies`, so programs that draw
+      nothing start quickly.
 """
 
 from typing import TYPE_CHECKING
@@ -23,7 +24,6 @@ __all__ = [
     "compose_citation",
     "compose_doctor",
     "compose_ping",
-    "compose_topic_delays",
     "describe_energy_obstacle",
     "describe_judgement",
     "describe_moving_states",
@@ -69,19 +69,14 @@ if TYPE_CHECKING:
     from .export import Exporter
     from .exports import list_export_formats
     from .figures.registry import FIGURES, figure, write_figures, write_overlay
+    from .foxglove_layout import write_foxglove_layout
     from .linear_text import describe_moving_states
-    from .premise_text import describe_energy_obstacle
     from .rerun_viewer import ViewerOptions, open_rerun
     from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
-    from .summary_text import (
-        compose_benchmark,
-        compose_doctor,
-        compose_ping,
-        compose_topic_delays,
-    )
+    from .summary_text import compose_benchmark, compose_doctor, compose_ping
     from .terminal_output import err, print_error, print_json, print_line, print_table
-    from .viewer_files import write_foxglove_layout
+    from .verdict_text import describe_energy_obstacle
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -94,18 +89,16 @@ else:
             "export": "Exporter",
             "exports": "list_export_formats",
             "figures.registry": "FIGURES figure write_figures write_overlay",
+            "foxglove_layout": "write_foxglove_layout",
             "linear_text": "describe_moving_states",
-            "premise_text": "describe_energy_obstacle",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable compose format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
-            "summary_text": (
-                "compose_benchmark compose_doctor compose_ping compose_topic_delays"
-            ),
+            "summary_text": "compose_benchmark compose_doctor compose_ping",
             "terminal_output": (
                 "err print_error print_json print_line print_table terminal_output"
             ),
-            "viewer_files": "write_foxglove_layout",
+            "verdict_text": "describe_energy_obstacle",
         },
     )
 
@@ -121,7 +114,7 @@ register_hooks(
         "describe a finding": "finding_text:describe_finding",
         "describe what roots leave out": "decision_text:describe_left_out",
         "list the sentences of a finding": "finding_text:list_finding_sentences",
-        "describe a premise": "premise_text:describe_quantities",
+        "describe a premise": "verdict_text:describe_quantities",
         "name the theorem": "verdict_text:name_theorem",
     },
 )

@@ -1,15 +1,15 @@
-"""Composes the short texts of `trilat certify` and `trilat metrics`, of about ten lines each.
+"""Composes the short output of `trilat certify` and `trilat metrics`, about ten lines each.
 
-A reader should see within seconds whether a run was stable and how well the arms followed each
-other. With the option --all, these commands print everything, see `certificate_text` and
-`summary_text`.
+The short output lets a reader see within seconds whether a run was stable and how well the arms
+followed each other. With the option --all, the commands print everything; see
+`certificate_text` and `summary_text`.
 
 Invariant:
-    - A short text has at most `MOST_LINES` lines, and one more line that mentions --all. The
-      meaning of a judgement and remarks about the run are not counted.
-    - Each line is also printed with --all, or contains the largest of the values that --all
-      prints.
-    - The judgement comes first, and a line that contradicts stability is never left out.
+    - A short text has at most `MOST_LINES` lines, plus one line that mentions --all. The
+      explanation of a verdict and remarks about the run are not counted.
+    - Each line is also printed with --all, or contains the largest of the values printed with
+      --all.
+    - The verdict comes first, and a line that contradicts stability is never omitted.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from .result_text import Block, TextTable
 from .untrusted_text import sanitize
 
 MOST_LINES = 10
-"""Largest number of lines of a short text."""
+"""Maximum number of lines of a short text."""
 _KEY_METRICS = (
     "max_error_rad",
     "max_error_m",
@@ -49,20 +49,21 @@ _KEY_METRICS = (
     "hands_j",
     "effort_nm2_s",
 )
-"""Keys of metrics, the most important first. The first ten that a run has are printed."""
+"""Metric keys in descending order of importance. The first ten available for a run are printed.
+"""
 _PREMISES = "premises are what the theorem requires (docs/reference/certificate-premises.md)"
 """Explanation of the word "premise" in the output of `trilat certify`."""
 _MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
-"""Importance of a line of a certificate, by its mark."""
+"""Rank of a certificate line by its mark; lower ranks are more important."""
 
 
 def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
-    """Yields the judgement whether a run was stable, and its most important reasons.
+    """Yields the stability verdict on a run and the most important reasons for it.
 
     `trilat certify` prints these lines by default, and all reasons with the option --all.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     lines = describe_certificate(certificate)
     judgement, *reasons = _choose_lines(lines)
@@ -84,10 +85,10 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
     """Selects the most important lines of a stability certificate, in their original order.
 
-    Lines that contradict stability are more important than lines that confirm it.
+    Lines that contradict stability take precedence over lines that confirm it.
 
     Args:
-        lines: All lines of the certificate, of which the first is the judgement.
+        lines: All lines of the certificate, starting with the verdict.
     """
     ranks = [_MARK_RANKS[line.mark] for line in lines]
     ranks[0] = -1
@@ -97,10 +98,10 @@ def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
 
 
 def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table with the ten most important metrics of a run, each with its subject.
+    """Yields a table of the ten most important metrics of a run, each with its subject.
 
-    The subject is, for example, the site with the largest value, or "every site" if all sites
-    have the same value.
+    The subject is, for example, the site with the largest value, or "every site" if the value
+    is the same at all sites.
 
     Args:
         metrics: All metrics of the run.
@@ -124,7 +125,7 @@ def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
     instead of the subject.
 
     Returns:
-        The four texts of the row. Empty if the quantity cannot exist for this run, or if a
+        The four cells of the row. Empty if the quantity cannot exist for this run, or if a
         missing value needs no explanation.
     """
     applicable = {
@@ -153,9 +154,9 @@ def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
 def _name_subject(quantity: Quantity, values: dict[str, Metric]) -> str:
     """Returns the name of the subject to which a value in the short table belongs.
 
-    For example, a quantity has a value per site, and the table shows only the largest value.
-    The name is then that of the site, such as "m1". The name is "all sites together" for a sum,
-    and "every site" if all values are equal.
+    For a quantity with one value per site, the table shows only the largest value, and this is
+    the name of that site, such as "m1". For a sum, it is "all sites together", and if all
+    values are equal, "every site".
     """
     numbers = {subject: metric.value for subject, metric in values.items()}
     known_values = {subject: value for subject, value in numbers.items() if value is not None}

@@ -1,15 +1,15 @@
-"""Composes the text that explains whether a run was stable, for the terminal and for a report.
+"""Composes the explanation of whether a run was stable, for the terminal and for reports.
 
-`analysis.certificate` judges the run from its log. `describe_certificate` returns the
-sentences, which the terminal and the report share. The terminal adds tables of the conditions
-of the stability theorem, and of the energies that changed V, the energy function of the
-stability proof.
+`analysis.certificate` judges the run from its log, and `describe_certificate` turns the result
+into the sentences shown in the terminal and in the report. The terminal output also includes
+tables of the premises of the stability theorem, and of the energies that changed V, the energy
+function in the stability proof.
 
 Invariant:
-    - The terminal and the report have the same sentences.
+    - The terminal and the report contain the same sentences.
     - The verdict comes first.
-    - The listed energies add up: V at the end is V at the start plus all other entries, up to
-      entries that are too small to be listed.
+    - The listed energies add up: V at the end is V at the start plus all other entries, except
+      for entries too small to be listed.
 """
 
 import math
@@ -39,15 +39,15 @@ from .end_text import name_behaviour
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
-"""Smallest listed energy, as a share of the largest energy."""
+"""Smallest energy to list, as a fraction of the largest energy."""
 MAX_LISTED_LINKS = 6
-"""Largest number of links that are listed. The energies of more links are summed."""
+"""Maximum number of links to list. If there are more, their energies are summed."""
 _SOURCE_NAMES = {
     "rule": "rule for stale peers",
     "shares": "change of shares",
     "estimates": "box, or wrong estimates",
 }
-"""Texts of the sources of energy other than links, by their names in a balance."""
+"""Display names of energy sources other than links, keyed by their names in a balance."""
 
 _OTHER_ENDS = {
     EndBehaviour.CONVERGED: "the record ends with slow arms",
@@ -59,20 +59,20 @@ _OTHER_ENDS = {
     EndBehaviour.DRIFTS: "an arm still drifts at the end of the record",
     EndBehaviour.GROWS: "the motion still grows at the end of the record",
 }
-"""Clauses about the end of a record, for runs whose judgement differs from that of the end
-alone.
+"""Clauses about the end of a record, for runs whose verdict differs from what the end alone
+suggests.
 """
 
 _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
 def compose_certificate(certificate: Certificate) -> Iterator[Block]:
-    """Yields the text of a stability certificate: judgement, reasons, and tables.
+    """Yields the text of a stability certificate: verdict, reasons, and tables.
 
-    The tables contain the premises (conditions of the stability theorem) and the energies.
+    The tables list the premises of the stability theorem and the energies.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     judgement, *reasons = describe_certificate(certificate)
     for line in (judgement, *describe_in_words(certificate), *reasons):
@@ -101,14 +101,14 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
 
 
 def select_premises(certificate: Certificate) -> list[premise_quantities.Premise]:
-    """Returns the conditions (premises) of stability that apply to the control laws of a run.
+    """Returns the stability premises that apply to the control laws of a run.
 
-    Most of them belong to the stability theorem of the paper, which is about an energy function
-    V. For control laws without such a function, only the condition about walls applies, and the
-    conditions that the law itself declares.
+    Most premises belong to the stability theorem of the paper, which is based on an energy
+    function V. For control laws without such a function, only the premise about walls and the
+    premises declared by the law itself apply.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     premises = list(certificate.premises)
     if not certificate.has_functional:
@@ -119,18 +119,17 @@ def select_premises(certificate: Certificate) -> list[premise_quantities.Premise
 
 
 def _tabulate_premises(premises: Sequence[premise_quantities.Premise]) -> TextTable:
-    """Returns a table with a row per premise: whether it holds, and why."""
+    """Returns a table with one row per premise, stating whether it holds and why."""
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
     styles = {"holds": "green", "fails": "yellow"}
     return TextTable(("premise", "", "finding"), rows, styles=styles)
 
 
 def compose_twins(twins: PushedTwins) -> Iterator[Block]:
-    """Yields the text about the repetitions of a run with small pushes.
+    """Yields a description of the twins of a run: its repetitions with small pushes.
 
-    A repetition with a push is called a twin, and shows whether small disturbances grow. The
-    text states the size up to which the effect of a push is proportional to the push, and
-    contains a line about each push.
+    Twins show whether small disturbances grow. The text states the size up to which the effect
+    of a push is proportional to the push, followed by one line per push.
 
     Args:
         twins: The run and its twins.
@@ -144,12 +143,11 @@ def compose_twins(twins: PushedTwins) -> Iterator[Block]:
 
 
 class CertificateLine(NamedTuple):
-    """One line of a stability certificate: a sentence with a mark such as "ok" or "FAIL".
+    """One line of a stability certificate: a sentence marked with, for example, "ok" or "FAIL".
 
     Attributes:
-        mark: "ok" if the sentence is evidence that the run was stable, "FAIL" if it is
-            evidence against it, "open" if it leaves the question open, and "note" for other
-            sentences.
+        mark: "ok" for evidence that the run was stable, "FAIL" for evidence that it was not,
+            "open" for evidence that leaves the question open, and "note" for anything else.
         text: The sentence.
     """
 
@@ -158,24 +156,24 @@ class CertificateLine(NamedTuple):
 
     @property
     def print_form(self) -> MarkedText:
-        """The sentence with its coloured mark, as the terminal and the page show it.
+        """The sentence with its coloured mark, as shown in the terminal and on the page.
 
-        For example, the mark is "ok". If the sentence begins with the same word and a colon,
-        the word is left out of the sentence, so that it does not appear twice.
+        If the sentence itself starts with the mark and a colon, as in "note: ...", that prefix
+        is removed so that the mark does not appear twice.
         """
         return MarkedText(MARKS[self.mark], self.text.removeprefix(f"{self.mark}: "))
 
 
 def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the judgement of a certificate, and then its reasons, each as a marked sentence.
+    """Returns the verdict of a certificate followed by its reasons, each as a marked sentence.
 
-    The reasons are: the energy function V of the stability proof; the end of the run; the
-    energy balance; the energies that control laws declare; the characteristic roots; the twins,
-    which are repeated runs with a small push; and the log itself. Reasons that do not exist for
-    a run are left out.
+    The possible reasons are the energy function V of the stability proof, the end of the run,
+    the energy balance, energies declared by control laws, the characteristic roots, the twins
+    (repeated runs with a small push), and the log itself. Reasons that are not available for
+    the run are omitted.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     lines = _describe_verdict(certificate)
     if certificate.balance is not None:
@@ -213,23 +211,23 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
 
 
 def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
-    """Explains in sentences what the judgement of a run means, with remarks about the run.
+    """Explains in full sentences what the verdict on a run means, with remarks about the run.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     sentences = [_explain_judgement(certificate), *certificate.remarks]
     return [CertificateLine("note", sentence) for sentence in sentences if sentence]
 
 
 def _explain_judgement(certificate: Certificate) -> str:
-    """Returns a sentence in plain words on what a judgement means for small disturbances.
+    """Returns a sentence in plain words on what a verdict means for small disturbances.
 
     For example: "a small disturbance halves every 0.83 s".
 
     Returns:
-        The sentence. Empty for a run that diverged or is open (undecided), because the
-        judgement itself says why.
+        The sentence. Empty for a run that diverged or whose verdict is open, because the
+        verdict itself gives the reason.
     """
     stability = certificate.stability
     if certificate.end.behaviour is EndBehaviour.DIVERGED or stability is Stability.OPEN:
@@ -255,12 +253,12 @@ def _explain_judgement(certificate: Certificate) -> str:
 
 
 def describe_settling(certificate: Certificate) -> str:
-    """Returns a clause on the observed motion of a run that settled without a stability proof.
+    """Returns a clause on the motion of a run that settled without a stability proof.
 
-    A settled run has become slow, or its motion decays. Its arms need not be at rest.
+    In a settled run, the motion is slow or decaying, but the arms are not necessarily at rest.
 
     Args:
-        certificate: Judgement of a run that settled, with its reasons.
+        certificate: Stability certificate of a run that settled.
     """
     speed = f"{certificate.end.end_speed_rad_s:.2g} rad/s"
     return (
@@ -270,17 +268,17 @@ def describe_settling(certificate: Certificate) -> str:
 
 
 def describe_pace(certificate: Certificate) -> str:
-    """Returns how fast a small disturbance of the final pose dies away or grows, as a sentence.
+    """Returns a sentence on how fast a small disturbance of the final pose decays or grows.
 
-    For example: "a small disturbance halves every 0.83 s". The rate is that of the
-    characteristic root of the linearised control loop that decays most slowly or, if a root
-    grows, of the root that grows fastest.
+    For example: "a small disturbance halves every 0.83 s". The rate is that of the slowest
+    characteristic root of the linearised control loop or, if any root is unstable, of the
+    fastest growing one.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
 
     Returns:
-        The sentence. Empty if the roots prove nothing, or if their rate is unknown.
+        The sentence, or an empty string if the roots are inconclusive or their rate is unknown.
     """
     roots = certificate.roots
     if roots is None or not roots.rate_per_s:
@@ -294,10 +292,10 @@ def describe_pace(certificate: Certificate) -> str:
 
 
 def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the first lines of a certificate: judgement, stability theorem, end of the run.
+    """Returns the first lines of a certificate: verdict, stability theorem, end of the run.
 
     Each line has a mark such as "ok" or "FAIL". V is the energy function of the theorem, which
-    must not rise by itself in a stable run.
+    must not rise on its own in a stable run.
     """
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
     verdict_mark = "ok" if certificate.bounded_by_v else "open"
@@ -323,15 +321,14 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
 def describe_theorem(certificate: Certificate) -> list[str]:
     """Returns a line that says whether the paper's stability theorem applies to a run.
 
-    A theorem in the paper guarantees stability if the controller and the network fulfil its
-    conditions. The line states whether these conditions were fulfilled.
+    The theorem guarantees stability if the controller and the network satisfy its premises. The
+    line states whether they were satisfied in this run.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
 
     Returns:
-        The line. Empty if the theorem is about a different control law and therefore does not
-        apply.
+        A list with the line. Empty if the theorem does not cover the control law of the run.
     """
     if not certificate.has_functional:
         return []
@@ -342,12 +339,12 @@ def describe_theorem(certificate: Certificate) -> list[str]:
 def _compare_rates(
     roots: decision_facts.LoopRoots | None, twins: TwinGrowth
 ) -> list[CertificateLine]:
-    """Returns a remark on why two rates of decay differ, if their printed values differ.
+    """Returns a remark on why two decay rates differ, if they are printed differently.
 
     A certificate states the rate of the characteristic roots, and the rate at which small
-    pushes of the arms died away in repetitions of the run (twins). Both are rates of
-    amplitudes. The roots describe small motions near one pose, whereas a push develops along
-    the motion of the run for a limited time.
+    pushes died away in repetitions of the run (twins). Both are amplitude rates. The roots
+    describe small motions near one pose, whereas a push develops along the motion of the run
+    for a limited time.
 
     Args:
         roots: Characteristic roots of the loop at its final pose. `None` if they were not
@@ -355,7 +352,7 @@ def _compare_rates(
         twins: Growth of the pushes.
 
     Returns:
-        A remark. Empty if the rates agree, or if one of them is unknown.
+        A list with the remark. Empty if the rates agree, or if one of them is unknown.
     """
     worst_push = twins.worst
     if roots is None or roots.rate_per_s is None or worst_push is None:
@@ -381,7 +378,7 @@ def _compare_rates(
 
 
 def _describe_evidence(certificate: Certificate) -> CertificateLine:
-    """Returns the line that says whether the log is complete and intact."""
+    """Returns a line that says whether the log is complete and intact."""
     evidence = certificate.evidence
     mark = "open" if evidence.reasons else "ok"
     if not evidence.integrity.passed:
@@ -390,13 +387,13 @@ def _describe_evidence(certificate: Certificate) -> CertificateLine:
 
 
 def _describe_paper_weights(certificate: Certificate) -> str:
-    """Returns a sentence on the rise that V would have had with the weights of the paper.
+    """Returns a sentence on how much V would have risen with the weights used in the paper.
 
-    V is the energy function of the stability proof, a weighted sum over the sites. The paper's
-    weights, all equal to 1, are right only for some networks.
+    V is the energy function in the stability proof, a weighted sum over the sites. The paper
+    sets all weights to 1, which is correct only for some networks.
 
     Returns:
-        A sentence. Empty if the paper's weights are right for this run.
+        A sentence. Empty if the paper's weights are correct for this run.
     """
     balance = certificate.paper_balance
     rise = certificate.paper_weights_rise
@@ -408,13 +405,13 @@ def _describe_paper_weights(certificate: Certificate) -> str:
 
 
 def compose_headline(certificate: Certificate) -> str:
-    """Returns the judgement of a run and its basis in one line.
+    """Returns the verdict on a run and the basis for it, on one line.
 
-    For example "stable: converged; rests on: exact roots, slowest -0.832 /s". If the arms
-    exceeded their limits, the line says which joint did so, and when.
+    For example: "stable: converged; rests on: exact roots, slowest -0.832 /s". If an arm
+    exceeded its limits, the line says which joint did so, and when.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     end = certificate.end
     if end.behaviour is EndBehaviour.DIVERGED:
@@ -434,10 +431,10 @@ def compose_headline(certificate: Certificate) -> str:
 
 
 def _describe_end(certificate: Certificate) -> str:
-    """Returns a phrase on the end of a run's motion that claims no more than the judgement.
+    """Returns a phrase on the end of a run's motion that claims no more than the verdict.
 
-    Only the phrase for a run that is judged as settled contains values: the error e and the
-    joint speed |qd|.
+    Values (the error e and the joint speed |qd|) are included only if the run is judged to have
+    settled.
     """
     end = certificate.end
     if certificate.stability is not Stability.SETTLED:
@@ -457,13 +454,13 @@ def _describe_end(certificate: Certificate) -> str:
 
 
 def describe_judgement(certificate: Certificate) -> str:
-    """Returns the judgement whether a run was stable, in one line.
+    """Returns the stability verdict on a run, on one line.
 
-    If the judgement is open, the line states the reasons. A reason that repeats the end of the
-    run is left out, because another line of the certificate is about the end.
+    If the verdict is open, the line states why. Reasons that concern the end of the run are
+    omitted because another line of the certificate covers them.
 
     Args:
-        certificate: Judgement whether a run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     if certificate.decision.is_too_short:
         return f"{certificate.stability}: {'; '.join(certificate.reasons)}"
@@ -503,8 +500,8 @@ _ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 def _mark_twins(twins: TwinGrowth) -> str:
     """Returns the mark of the sentence about twins: "ok" if all pushes die away.
 
-    The mark is "FAIL" if a push grows or the repetition departs from the run, "note" without
-    pushes, and "open" otherwise.
+    The mark is "FAIL" if a push grows or a repetition deviates from the run, "note" if there
+    are no pushes, and "open" otherwise.
     """
     if not twins.pushes:
         return "note"
@@ -517,11 +514,11 @@ def _mark_twins(twins: TwinGrowth) -> str:
 def _describe_balance(balance: EnergyBalance) -> str:
     """Returns a sentence about how well the energy balance of a run closes.
 
-    V is the energy function of the stability proof, in J. Its change should equal the work that
-    was done on the arms minus the dissipated energy. The difference is the residual. One cause
-    is that the controller acts only once per tick (period of the control loop), while the proof
-    assumes continuous time. The work of this sampling is computed. The sentence therefore also
-    says how small the residual is without this work.
+    V is the energy function in the stability proof, in J. Its change should equal the work done
+    on the arms minus the dissipated energy. The difference is the residual. One cause of a
+    residual is sampling: the controller acts only once per tick, while the proof assumes
+    continuous time. Since the work caused by sampling is known, the sentence also states how
+    small the residual is without it.
 
     Args:
         balance: The energy balance of the run.
@@ -541,17 +538,17 @@ def _describe_balance(balance: EnergyBalance) -> str:
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
-    """Lists the energies of the balance of V, the energy function of the stability proof.
+    """Lists the entries of the energy balance of V, the energy function in the stability proof.
 
     The entries are V at the start, the energies that changed V, and V at the end, in J.
-    Energies below `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
-    `MAX_LISTED_LINKS` links, their energies are summed.
+    Energies below `MIN_ENERGY_SHARE` of the largest one are omitted. If there are more than
+    `MAX_LISTED_LINKS` links, their energies are combined into one entry.
 
     Args:
         balance: The energy balance.
 
     Returns:
-        Name and energy of each entry.
+        One (name, energy in J) pair per entry.
     """
     link_energies: dict[str, Array] = {}
     source_energies: dict[str, Array] = {}
@@ -585,10 +582,10 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
 
 
 def _compute_rest(balance: EnergyBalance) -> Array:
-    """Returns the change of the energy V that no known cause explains, shape (T,), in J.
+    """Returns the change of the energy V that no known cause explains, in J, shape (T,).
 
-    V belongs to the stability proof. The table of energies lists this change as "unexplained".
-    It should be close to 0, except in gaps of the records.
+    The table of energies lists this change as "unexplained". It should be close to 0, except in
+    gaps of the records.
     """
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
@@ -600,8 +597,8 @@ def _compute_rest(balance: EnergyBalance) -> Array:
 def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
     """Returns the name and the value in J of the energy function V at one tick.
 
-    The name is for example "V at 2.5 s". A tick is a control period. If V is smaller than the
-    rounding errors, 0 is returned.
+    The name is, for example, "V at 2.5 s". If V is smaller than the rounding errors, 0 is
+    returned.
     """
     energy_j = float(balance.V[index])
     shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0

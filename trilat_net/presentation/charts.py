@@ -1,18 +1,19 @@
-"""Computes the data of the interactive charts in the report of a run, a web page.
+"""Computes the data for the interactive charts in the report of a run, a web page.
 
-Scripts in the page draw the charts. The charts need signals of the run, such as joint angles
-and torques. A log typically contains a value per millisecond, which is far too much for a page.
-`ChartBuilder` therefore divides the time into intervals, and keeps the least and the largest
-value of each interval (decimation). The result consists of tables of columns, and of charts
-whose lines refer to these columns by index. `page_data` defines the types of the data.
+Scripts in the page draw the charts from signals of the run, such as joint angles and torques. A
+log typically contains one value per millisecond, which is far too much for a page, so
+`ChartBuilder` decimates the signals: it divides the time axis into intervals and keeps the
+minimum and maximum of each interval. The result consists of tables of columns, and of charts
+whose lines refer to these columns by index. The data types are defined in `page_data`.
 
 Invariant:
-    - Every spike of the log is on the page, because decimation keeps the least and the largest
-      value of an interval.
-    - Every line of a chart has a value to draw. A chart without any line is left out, and
-      `_PageCharts.missing` names the chart, so that the page can mention it.
-    - Numbers are stored as base64 text of little-endian int32 and float32, which is a third of
-      the length of decimal text.
+    - Every spike in the log is visible on the page, because decimation keeps the minimum and
+      maximum of each interval.
+    - Every line of a chart has at least one value to draw. Charts without any lines are
+      omitted, and their titles are listed in `_PageCharts.missing` so that the page can mention
+      them.
+    - Numbers are stored as base64-encoded little-endian int32 and float32, which takes a third
+      of the space of decimal text.
 """
 
 import base64
@@ -22,66 +23,55 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..analysis import DelayDistribution, Timeline, joint_positions_m, site_signals
+from ..analysis import DelayDistribution, Timeline, build_arm_rows, site_signals
 from ..core import Array
 from ..log import Ints, Log, SiteLog
+from ..scenario import Scenario
 from . import plot_signals, style
 from .appearance import DARK_SITE_COLOURS, list_site_colours
 from .figures import age_and_lateness, arm_poses
 from .page_data import (
-    ChainArm,
     Chart,
-    ColumnTable,
     DistributionChart,
-    DistributionSeries,
     HistogramChart,
-    HistogramSeries,
-    MarkedChange,
-    ModeSpan,
     PageData,
-    Palettes,
-    PlanarArm,
-    StatedLine,
-    TableSeries,
     TimeChart,
 )
-from .page_leaders import caption_site, list_lead_bars, trace_leads
+from .page_leaders import SlaveLead
 from .plot_signals import decimate
 
 Values = NDArray[Any]
-"""Numbers of any type."""
+"""Numerical array of any type."""
 
 BUCKET_BUDGET = 48_000
-"""Number of buckets of all columns together. This limit keeps a page near 1 MB for any number
-of sites.
+"""Total number of buckets of all columns. This limit keeps a page near 1 MB for any number of
+sites.
 """
 _MIN_BUCKETS = 100
-"""Smallest number of buckets of a column, whatever the budget."""
+"""Minimum number of buckets per column, whatever the budget."""
 _MAX_BUCKETS = 1200
-"""Largest number of buckets of a column."""
+"""Maximum number of buckets per column."""
 _BOX_INSTANTS = 60
-"""Number of instants at which the box around the motion of the arms is measured."""
+"""Number of instants used to compute the bounding box of the arms' motion."""
 _CHAIN_INSTANTS = 400
-"""Largest number of instants for which the page has the joint positions of a chain."""
+"""Maximum number of instants for which the page contains the joint positions of a chain."""
 _MAXIMA = 400
-"""Number of intervals of a line of maxima."""
+"""Number of time intervals in a line of maxima."""
 _LEAST_DRAWN = 1e-6
-"""Smallest drawn maximum. Smaller maxima are drawn at this value, because a logarithmic axis
-has no zero.
+"""Smallest maximum that is drawn. Smaller maxima are drawn at this value, because a logarithmic
+axis has no zero.
 """
 PICTURE_SIDE = 4.0
-"""Longer side of a scaled picture, in the unit of the line widths of the page."""
+"""Longer side of a scaled picture, in the unit of line widths on the page."""
 
 
 class _PageCharts(NamedTuple):
-    """All charts of a run's report, as `ChartBuilder.build` returns them.
-
-    The report is a web page whose scripts draw the charts.
+    """All charts of a run's report page, as returned by `ChartBuilder.build`.
 
     Attributes:
         data: Data that the scripts of the page draw.
-        missing: Titles of the charts that are left out because the log has no value for them,
-            by section of the page.
+        missing: Mapping from page section to the titles of charts that are omitted because the
+            log has no data for them.
     """
 
     data: PageData
@@ -89,21 +79,21 @@ class _PageCharts(NamedTuple):
 
 
 class ChartBuilder:
-    """Computes from a log the charts of the web page that reports the run.
+    """Computes the charts of a run's report page from its log.
 
-    The values of the signals become tables, from which the scripts of the page draw the charts
-    in the browser.
+    The signals are stored in tables, from which scripts draw the charts in the browser.
 
     Args:
         log: Log of the run.
-        twin: Log of the same run without operators, the people or programs that move the arms.
-            If `None`, the chart of the motion due to operators is left out.
+        twin: Log of the same run without operators. If `None`, the chart of the motion caused
+            by operators is omitted.
 
     Attributes:
-        bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
-        units_per_m: Scale of the pictures of the arms, in units of the picture per m. Pictures
-            with a chain, and of planar arms that move in less than half of `PICTURE_SIDE`, are
-            scaled to that size, because the widths of lines are fixed. Other pictures have the
+        bounds_m: Left, right, bottom and top of the bounding box of the motion of all arms, in
+            m.
+        units_per_m: Scale of the pictures of the arms, in picture units per m. Pictures that
+            contain a chain, or planar arms that move within less than half of `PICTURE_SIDE`,
+            are scaled up to that size because line widths are fixed. All other pictures have
             scale 1.
         leads: Weights with which each slave follows the other arms over time.
     """
@@ -113,9 +103,9 @@ class ChartBuilder:
         self._twin = twin
         self._timeline = Timeline(log)
         self._end_s = self._timeline.end_s
-        self._tables: list[ColumnTable] = []
+        self._tables: list[PageData.Table] = []
         self._has_values: list[list[bool]] = []  # by table and column
-        self.leads = trace_leads(log)
+        self.leads = SlaveLead.list_of_log(log)
 
         # The pictures of the arms show the whole motion, which is sampled at a few times.
         times_s = np.linspace(0.0, self._end_s, _BOX_INSTANTS)
@@ -146,11 +136,11 @@ class ChartBuilder:
     def build(self) -> _PageCharts:
         """Computes all charts of the page: overview, motion of the arms, and timing.
 
-        A chart without any curve is left out, for example the estimates of a law that has none.
-        The page lists the titles of such charts by section.
+        A chart without any curves is omitted, for example the estimates of a law that estimates
+        nothing. The page lists the titles of omitted charts by section.
 
         Returns:
-            The data of the page, and the titles of the charts that are left out.
+            The page data, including the titles of omitted charts.
         """
         log = self._log
         charts: list[Chart] = []
@@ -173,20 +163,22 @@ class ChartBuilder:
             if len(log[site]):
                 arms.append(self._build_arm(index, site))
             intervals = self._timeline.find_mode_intervals(site)
-            spans[site] = [ModeSpan(index, *interval) for interval in intervals]
+            spans[site] = [PageData.ModeSpan(index, *interval) for interval in intervals]
 
         changes = []
         for number, applied in enumerate(self._timeline.changes, 1):
             change = applied.change
-            changes.append(MarkedChange(number, change.at_s, applied.site, change.link))
+            changes.append(
+                PageData.MarkedChange(number, change.at_s, applied.site, change.link)
+            )
 
         light = list_site_colours(log.scenario)
         dark = list_site_colours(log.scenario, DARK_SITE_COLOURS)
         data = PageData(
             end_s=self._end_s,
-            colours=Palettes(light, dark),
+            colours=PageData.Palettes(light, dark),
             arms=arms,
-            leads=list_lead_bars(self.leads),
+            leads=[lead.bar for lead in self.leads if not lead.is_constant],
             tables=self._tables,
             charts=charts,
             changes=changes,
@@ -196,15 +188,15 @@ class ChartBuilder:
         return _PageCharts(data, missing)
 
     def _build_overview_charts(self) -> Iterator[TimeChart]:
-        """Yields the two charts of the first screen: the error and the delay of each site.
+        """Yields the two charts at the top of the page: the error and the delay of each site.
 
-        In each chart a site has a single line: the largest error of its joints, or the age of
-        the oldest sample that its controller used.
+        Each chart has one line per site: the largest error of any joint, or the age of the
+        oldest sample used by the controller.
         """
         log = self._log
         unit = plot_signals.shared_unit(log)
         settled_line = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
-        stated_delays: list[StatedLine] = []
+        stated_delays: list[TimeChart.StatedLine] = []
         for site in log.sites:
             stated_delays += self._list_stated_delays(site)
         has_one_delay = len({line.value for line in stated_delays}) == 1
@@ -247,15 +239,15 @@ class ChartBuilder:
                 return f" Errors below {_LEAST_DRAWN:g} {unit} are drawn at this value."
         return ""
 
-    def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
-        """Adds a line per arm with the largest value of a signal in each short time interval.
+    def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TimeChart.Series]:
+        """Adds one line per arm with the largest value of a signal in each short time interval.
 
-        Within an interval, the line is constant. A line of the values themselves would be a
-        broad band wherever the values oscillate.
+        The line is constant within an interval. Plotting the values themselves would result in
+        a broad band wherever they oscillate.
 
         Args:
-            read_values: Function that returns the values of a site, given its name, with a row
-                for each record.
+            read_values: Function that takes the name of a site and returns its values, with one
+                row per record.
         """
         series = []
         for site in self._log.sites:
@@ -285,7 +277,8 @@ class ChartBuilder:
     def _build_motion_charts(self) -> Iterator[TimeChart]:
         """Yields charts of the arms' torques, positions, errors, estimates and displacements.
 
-        A chart is left out if the run lacks the quantity, such as the operator's torque.
+        Charts of quantities that the run does not have, such as an operator torque, are
+        omitted.
         """
         log = self._log
         operated_sites = plot_signals.sites_with_operator(log)
@@ -323,8 +316,7 @@ class ChartBuilder:
     def _build_timing_charts(self) -> Iterator[Chart]:
         """Yields charts of the network delays and of the timing of the control loops.
 
-        Charts of delays need a delay that varies, and charts of the loop need a run in real
-        time.
+        Delay charts require a delay that varies, and loop charts require a run in real time.
         """
         log = self._log
         yield from self._chart_ages()
@@ -344,28 +336,28 @@ class ChartBuilder:
     def _add_table(self, site: str, tick: Ints, values: Values) -> int:
         """Adds a table of values to the report, from which its scripts draw curves.
 
-        The values are encoded in binary form, which is shorter than decimal text.
+        The values are encoded in binary form, which is more compact than decimal text.
 
         Args:
-            site: Name of the site, whose tick rate converts ticks (control periods) to times.
+            site: Name of the site, whose tick rate converts ticks to times.
             tick: Ticks of the values, shape (P,).
-            values: The values, shape (P, C), a column per quantity.
+            values: The values, one column per quantity, shape (P, C).
 
         Returns:
             The index of the table.
         """
         columns = [_encode(column, "<f4") for column in values.T]
         rate_hz = self._log.scenario.sites[site].rate_hz
-        table = ColumnTable(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
+        table = PageData.Table(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
         self._tables.append(table)
         has_values = [bool(np.isfinite(column).any()) for column in values.T]
         self._has_values.append(has_values)
         return len(self._tables) - 1
 
     def _add_decimated(self, site: str, tick: Ints, t_s: Array, values: Values) -> int:
-        """Reduces values to the extremes of intervals, and adds them to the page as a table.
+        """Decimates values to the extremes of each interval, and adds them as a table.
 
-        Each interval keeps its least and largest value, so that no spike is lost.
+        Each interval keeps its minimum and maximum, so that no spike is lost.
 
         Args:
             site: Name of the site.
@@ -382,11 +374,12 @@ class ChartBuilder:
     def _add_records(self, site: str, values: Values) -> int:
         """Adds as many recorded values of one arm as a page can show, as a table.
 
-        A long run has more records than the page can show. The extremes of the values are kept.
+        A long run has more records than the page can show. In that case, the extremes of the
+        values are kept.
 
         Args:
             site: Name of the site.
-            values: A row of values for each record of the site, shape (K, C).
+            values: One row of values per record, shape (K, C).
 
         Returns:
             The index of the table.
@@ -396,8 +389,8 @@ class ChartBuilder:
 
     def _add_signal(
         self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
-    ) -> dict[str, list[TableSeries]]:
-        """Adds the values of a signal, such as joint torques, to the report, for several arms.
+    ) -> dict[str, list[TimeChart.Series]]:
+        """Adds the values of a signal, such as joint torques, to the report for several arms.
 
         Args:
             signal: Function that computes the values of the signal, shape (K, C), from the K
@@ -405,7 +398,7 @@ class ChartBuilder:
             sites: Names of the sites. Empty for all sites.
 
         Returns:
-            For each site, the lines of the chart: one per column of the signal.
+            For each site, the lines of the chart, one per column of the signal.
         """
         series = {}
         for site in sites or self._log.sites:
@@ -416,10 +409,10 @@ class ChartBuilder:
 
     def _add_columns(
         self, site: str, tick: Ints, t_s: Array, values: Values
-    ) -> list[TableSeries]:
+    ) -> list[TimeChart.Series]:
         """Adds as many values of one arm to the page as a screen can show.
 
-        All columns share one table if there are few of them. Otherwise each column has its own
+        If there are only a few columns, they share one table. Otherwise each column has its own
         table, which is smaller in total, see `__init__`.
 
         Args:
@@ -429,7 +422,7 @@ class ChartBuilder:
             values: The values, shape (K, C).
 
         Returns:
-            A line per column.
+            One line per column.
         """
         if self._has_table_per_column:
             tables = [
@@ -441,31 +434,33 @@ class ChartBuilder:
         columns = range(values.shape[1])
         return [self._make_series(site, table, column) for column in columns]
 
-    def _make_series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
-        """Returns a line of a chart in the colour of an arm.
+    def _make_series(
+        self, site: str, table: int, column: int, label: str = ""
+    ) -> TimeChart.Series:
+        """Returns a chart line in the colour of an arm.
 
         Args:
             site: Name of the site.
             table: Index of the table with the values of the line.
             column: Index of the column in this table.
-            label: Text in the legend. Empty for the name of the site.
+            label: Label in the legend. Empty to use the name of the site.
         """
         colour = self._log.sites.index(site)
-        return TableSeries(label=label or site, colour=colour, table=table, column=column)
+        return TimeChart.Series(label=label or site, colour=colour, table=table, column=column)
 
     def _make_chart(
         self,
         section: str,
         title: str,
         unit: str,
-        series: Sequence[TableSeries],
+        series: Sequence[TimeChart.Series],
         sites: Sequence[str] = (),
         **options: Any,
     ) -> TimeChart:
-        """Returns a chart over time, without lines that have no value to draw.
+        """Returns a chart over time, excluding lines that have no values to draw.
 
         Args:
-            section: Key of the section of the page, as in `report.toml`.
+            section: Key of the page section, as in `report.toml`.
             title: Title of the chart.
             unit: Unit of the values.
             series: The lines.
@@ -488,18 +483,18 @@ class ChartBuilder:
         section: str,
         title: str,
         unit: str,
-        series_by_site: dict[str, list[TableSeries]],
+        series_by_site: dict[str, list[TimeChart.Series]],
         titles: Sequence[str] = (),
     ) -> Iterator[TimeChart]:
-        """Yields one chart per joint, in which each arm has a line.
+        """Yields one chart per joint, with one line per arm.
 
         Args:
-            section: Key of the section of the page, as in `report.toml`.
+            section: Key of the page section, as in `report.toml`.
             title: Name of the quantity.
             unit: Unit of the quantity.
-            series_by_site: For each site, a line per joint. Sites may have different numbers of
-                joints.
-            titles: Names of the joints, or of the axes of the task. Empty for the joints'
+            series_by_site: For each site, one line per joint. Sites may have different numbers
+                of joints.
+            titles: Names of the joints, or of the task-space axes. Empty to use the joint
                 names.
         """
         for joint, name in enumerate(titles or self._joint_titles):
@@ -507,9 +502,9 @@ class ChartBuilder:
             yield self._make_chart(section, f"{title}, {name}", unit, series)
 
     def _chart_positions(self) -> Iterator[TimeChart]:
-        """Yields a chart per arm and joint, with the actual and the desired angle over time.
+        """Yields one chart per arm and joint, with the actual and the desired angle over time.
 
-        The desired angle follows from the received states of the other arms.
+        The desired angle is computed from the received states of the other arms.
         """
         for site in self._log.sites:
             records = self._log[site]
@@ -520,7 +515,7 @@ class ChartBuilder:
                 angles = np.stack([actual[:, joint], desired[:, joint]], axis=1)
                 table = self._add_records(site, angles)
                 actual_line = self._make_series(site, table, column=0)
-                desired_line = TableSeries(
+                desired_line = TimeChart.Series(
                     label="desired", colour="limit", table=table, column=1, dash=True
                 )
 
@@ -533,10 +528,10 @@ class ChartBuilder:
                 )
 
     def _chart_estimates(self) -> Iterator[TimeChart]:
-        """Yields a chart per inertial parameter of the arms.
+        """Yields one chart per inertial parameter of the arms.
 
         Adaptive control laws estimate the inertial parameters of their arm while it moves. Each
-        chart has a line per site, and dashed lines at the true values of the scenario.
+        chart has one line per site, and dashed lines at the true values from the scenario.
         """
         log = self._log
         estimates = self._add_signal(site_signals.parameter_estimates)
@@ -558,36 +553,37 @@ class ChartBuilder:
                 lines=self._draw_truths(true_values),
             )
 
-    def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
+    def _draw_truths(self, truths: Sequence[float]) -> list[TimeChart.StatedLine]:
         """Returns lines at the true values of a parameter over the whole run.
 
-        An adaptive control law estimates the parameters of the arm, and the lines show how
-        close the estimates come.
+        The lines show how close the estimates of an adaptive control law come to the true
+        values.
 
         Args:
-            truths: The true value for each site.
+            truths: The true value at each site.
 
         Returns:
-            A line per site in its colour. If all values are equal, a single line in a neutral
+            One line per site in its colour. If all values are equal, a single line in a neutral
             colour.
         """
         if len(set(truths)) == 1:
             return [self._draw_limit(truths[0])]
         lines = []
         for colour, truth in enumerate(truths):
-            lines.append(StatedLine(value=truth, colour=colour, from_s=0.0, to_s=self._end_s))
+            lines.append(
+                TimeChart.StatedLine(value=truth, colour=colour, from_s=0.0, to_s=self._end_s)
+            )
         return lines
 
-    def _draw_limit(self, value: float) -> StatedLine:
-        """Returns a line at a value over the whole run, in a neutral colour."""
-        return StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
+    def _draw_limit(self, value: float) -> TimeChart.StatedLine:
+        """Returns a line at a constant value over the whole run, in a neutral colour."""
+        return TimeChart.StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
 
     def _chart_ages(self) -> Iterator[TimeChart]:
-        """Yields a chart per site with the age of the samples that its controller uses.
+        """Yields one chart per site with the ages of the samples that its controller uses.
 
-        A sample is the state that a peer (another site) publishes in one control period. Its
-        age is the time since it was sent: the delay that the controller experiences. Dashed
-        lines show the delays that the scenario states.
+        The age of a sample is the time since it was sent, which is the delay experienced by the
+        controller. Dashed lines show the delays specified in the scenario.
         """
         log = self._log
         for site in log.sites:
@@ -614,21 +610,21 @@ class ChartBuilder:
                 margin=0.025,
             )
 
-    def _list_stated_delays(self, site: str) -> list[StatedLine]:
-        """Returns lines at the mean delays that the scenario states for the links to a site.
+    def _list_stated_delays(self, site: str) -> list[TimeChart.StatedLine]:
+        """Returns lines at the mean delays that the scenario specifies for the links to a site.
 
-        They are drawn next to the measured delays, so that a reader sees whether the network
-        had the stated delays.
+        They are drawn next to the measured delays, to show whether the network had the
+        specified delays.
 
         Args:
             site: Name of the receiving site.
 
         Returns:
-            A line per peer and link model, from the start to the end of the model. If all
+            One line per peer and link model, from the start to the end of the model. If all
             delays are equal, a single line in a neutral colour.
         """
         log = self._log
-        lines: list[StatedLine] = []
+        lines: list[TimeChart.StatedLine] = []
         for peer in log[site].peers:
             colour = log.sites.index(peer)
             link = f"{peer}->{site}"
@@ -637,7 +633,7 @@ class ChartBuilder:
             models = zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True)
             for start_s, end_s, delay_ms in models:
                 if np.isfinite(delay_ms):
-                    line = StatedLine(
+                    line = TimeChart.StatedLine(
                         value=float(delay_ms),
                         colour=colour,
                         from_s=float(start_s),
@@ -651,13 +647,13 @@ class ChartBuilder:
         return lines
 
     def _chart_distributions(self) -> Iterator[DistributionChart]:
-        """Yields a chart per receiving site with the distributions of message ages and delays.
+        """Yields one chart per receiving site with the distributions of sample ages and delays.
 
         A curve at x shows the percentage of ages, or of delays, that are at most x ms. The age
-        of a message is its delay plus the time until a newer message replaces it.
+        of a sample is its delay plus the time until a newer sample replaces it.
         """
         distributions = DelayDistribution.list_of_log(self._log)
-        x_ms = age_and_lateness.choose_delay_axis_ms(distributions)
+        axis = age_and_lateness.DelayAxis.of_links(distributions)
         for site in self._log.sites:
             series = []
             for link in distributions:
@@ -667,11 +663,11 @@ class ChartBuilder:
                 curves = (("age", link.age_ms, False), ("delay", link.delay_ms, True))
                 for quantity, values_ms, dash in curves:
                     # A link without any message has no curve.
-                    percent = age_and_lateness.compute_cumulative_percent(values_ms, x_ms)
+                    percent = axis.compute_percent(values_ms)
                     if not np.isfinite(percent).any():
                         continue
 
-                    curve = DistributionSeries(
+                    curve = DistributionChart.Series(
                         label=f"{quantity}, {link.peer}",
                         colour=colour,
                         dash=dash,
@@ -684,18 +680,18 @@ class ChartBuilder:
                 title=f"delay and age on the way to {site}",
                 unit="ms",
                 series=series,
-                x=_encode(x_ms, "<f4"),
-                log=bool(x_ms[0] > 0.0),
+                x=_encode(axis.x_ms, "<f4"),
+                log=axis.is_logarithmic,
             )
 
     def _chart_histograms(self) -> Iterator[HistogramChart]:
         """Yields histograms that show whether the control loops kept their timing.
 
-        One histogram shows how late the loops woke up for their ticks (control periods), the
-        other how long the computation of a tick took.
+        One histogram shows how late the loops woke up for their ticks, the other how long the
+        computation of a tick took.
         """
         log = self._log
-        edges_us = age_and_lateness.choose_bin_edges_us(log)
+        bins = age_and_lateness.LoopTimeBins.of_log(log)
         rates_hz = {log.scenario.sites[site].rate_hz for site in log.sites}
         periods_us = sorted(1e6 / rate_hz for rate_hz in rates_hz)
 
@@ -708,26 +704,26 @@ class ChartBuilder:
             for colour, site in enumerate(log.sites):
                 if len(log[site]):
                     times_us = getattr(log[site], field)
-                    counts = age_and_lateness.bin_loop_times(times_us, edges_us)
-                    series.append(HistogramSeries(site, colour, counts.tolist()))
+                    counts = bins.count_times(times_us)
+                    series.append(HistogramChart.Series(site, colour, counts.tolist()))
 
             yield HistogramChart(
                 section="timing",
                 title=f"{title}, histogram",
                 unit="µs",
                 series=series,
-                edges=edges_us.tolist(),
+                edges=bins.edges_us.tolist(),
                 periods=periods_us,
             )
 
-    def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
-        """Adds the motion of an arm, and of bodies that it touches, for the moving picture.
+    def _build_arm(self, index: int, site: str) -> PageData.PlanarArm | PageData.ChainArm:
+        """Adds the motion of an arm, and of bodies that it touches, for the animated picture.
 
-        The script of the page draws planar arms from their joint angles and link lengths. Other
-        arms, called chains, are handled by `_build_chain`.
+        The script of the page draws planar arms from their joint angles and link lengths. All
+        other arms are chains and handled by `_build_chain`.
 
         Args:
-            index: Index of the site, which is also the index of its colour.
+            index: Index of the site, which is also its colour index.
             site: Name of the site, which must have at least one record.
 
         Returns:
@@ -743,42 +739,43 @@ class ChartBuilder:
         desired = plot_signals.reference_angles(records)
         bodies = self._trace_bodies(site, np.arange(len(records)))
         table = self._add_records(site, np.hstack([actual, desired, *bodies]))
-        return PlanarArm(
+        return PageData.PlanarArm(
             site=site,
-            caption=caption_site(self._log.scenario, site),
+            caption=_caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),
             links_m=[self.units_per_m * length_m for length_m in arm.lengths_m],
         )
 
-    def _build_chain(self, index: int, site: str) -> ChainArm:
-        """Adds the motion of a chain, an arm of any number of joints in space.
+    def _build_chain(self, index: int, site: str) -> PageData.ChainArm:
+        """Adds the motion of a chain, an arm with any number of joints in space.
 
-        The page cannot compute the forward kinematics of chains. Its table therefore contains
-        the joint positions in the picture, of the actual arm, of the reference and of the arm's
-        shadow on the floor, at up to `_CHAIN_INSTANTS` records.
+        The page cannot compute the forward kinematics of chains. The table therefore contains
+        projected joint positions of the actual arm, of the reference and of the arm's shadow on
+        the floor, for up to `_CHAIN_INSTANTS` records.
 
         Args:
-            index: Index of the site, which is also the index of its colour.
+            index: Index of the site, which is also its colour index.
             site: Name of the site, which must have at least one record.
 
         Returns:
             Description of the chain, which refers to the table of its motion.
         """
         records = self._log[site]
-        arm = self._log.scenario.arms[site]
+        arm = build_arm_rows(self._log.scenario, site)
         last_record = len(records) - 1
         record_indices = np.linspace(0, last_record, _CHAIN_INSTANTS).astype(np.int64)
         rows = np.unique(record_indices)  # a short log has fewer records than `_CHAIN_INSTANTS`
 
         desired_q = plot_signals.reference_angles(records)
-        actual_m = joint_positions_m(arm, records.q[rows])
-        desired_m = joint_positions_m(arm, desired_q[rows])
+        axes = arm.upright_axes
+        actual_m = arm.joint_positions_m(records.q[rows])
+        desired_m = arm.joint_positions_m(desired_q[rows])
         pictures = (
-            arm_poses.project_arm_m(arm, actual_m),
-            arm_poses.project_arm_m(arm, desired_m),
-            arm_poses.project_arm_m(arm, actual_m, onto_floor=True),
+            arm_poses.project_arm_m(axes, actual_m),
+            arm_poses.project_arm_m(axes, desired_m),
+            arm_poses.project_arm_m(axes, actual_m, onto_floor=True),
         )
         # The first point is the base, which does not move.
         moving_points_m = [picture[:, 1:] for picture in pictures]
@@ -786,9 +783,9 @@ class ChartBuilder:
         bodies = self._trace_bodies(site, rows)
         values = np.hstack([points.reshape(len(rows), -1), *bodies])
         table = self._add_table(site, records.tick[rows], values)
-        return ChainArm(
+        return PageData.ChainArm(
             site=site,
-            caption=caption_site(self._log.scenario, site),
+            caption=_caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),
@@ -796,34 +793,34 @@ class ChartBuilder:
         )
 
     def _trace_bodies(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """Returns the edges of each body that a site's arm can touch, as lines of the picture.
+        """Returns the edges of each body that a site's arm can touch, as lines in the picture.
 
-        The page draws them with the arm, for example the box that an arm pushes.
+        The page draws them together with the arm, for example a box pushed by the arm.
 
         Args:
             site: Name of the site.
             rows: Indices of K records.
 
         Returns:
-            For each body the coordinates of its P corners along all edges, shape (K, 2 P), in
-            units of the picture. Empty if the site has no bodies.
+            For each body, the coordinates of the P corners along its edge path, in picture
+            units, shape (K, 2 P). Empty if the site has no bodies.
         """
         sizes_m = self._log.scenario.bodies_m(site).values()
         if not sizes_m:
             return []
-        arm = self._log.scenario.arms[site]
+        arm = build_arm_rows(self._log.scenario, site)
         poses = self._log[site].bodies[rows]
-        paths_m = arm_poses.trace_bodies_m(arm, sizes_m, poses)
+        paths_m = arm_poses.trace_bodies_m(arm.upright_axes, sizes_m, poses)
         return [self.units_per_m * path.reshape(len(rows), -1) for path in paths_m]
 
 
 def _lateness_ms(records: SiteLog) -> Values:
-    """Returns the lateness of each tick, ms, shape (K, 1)."""
+    """Returns the lateness of each tick in ms, shape (K, 1)."""
     return records.late_us[:, np.newaxis] * 1e-3
 
 
 def _encode(column: Values, kind: str) -> str:
-    """Encodes numbers as base64 text, so that a web page can contain them compactly.
+    """Encodes numbers as a base64 string, for compact storage in a web page.
 
     Args:
         column: The numbers, shape (P,).
@@ -831,3 +828,20 @@ def _encode(column: Values, kind: str) -> str:
     """
     numbers = np.ascontiguousarray(column.astype(kind))
     return base64.b64encode(numbers.tobytes()).decode()
+
+
+def _caption_site(scenario: Scenario, site: str) -> str:
+    """Returns the caption of an arm in the drawing, for example "m1, master 1"."""
+    return f"{site}, {_name_role(scenario, site)}"
+
+
+def _name_role(scenario: Scenario, site: str) -> str:
+    """Returns the role of an arm in words: "master 2", or "slave" if there is only one slave.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site.
+    """
+    role = scenario.sites[site].role
+    with_role = [name for name, spec in scenario.sites.items() if spec.role == role]
+    return role if len(with_role) == 1 else f"{role} {with_role.index(site) + 1}"

@@ -1,12 +1,12 @@
-"""Composes a paragraph for a paper about the stability of a run, with its references.
+"""Composes a paragraph about the stability of a run for use in a paper, with references.
 
-The paragraph names the scenario, the program, the verdict with its basis, and the values behind
-it, so that a reader of the paper can reproduce and judge the statement. References follow as
-BibTeX entries.
+The paragraph names the scenario, the program, the verdict and its basis, and the underlying
+values, so that a reader of the paper can reproduce and assess the statement. References follow
+as BibTeX entries.
 
 Invariant:
-    - The paragraph states only facts that the certificate states.
-    - A source is listed only if the statement rests on it.
+    - The paragraph states only facts that are in the certificate.
+    - A source is listed only if the statement relies on it.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,7 +17,6 @@ from ..analysis import Certificate, Stability
 from ..errors import count_nouns
 from ..files import find_version
 from ..log import Log, collect_provenance
-from ..own_code import ImportedLaw
 from ..scenario import Scenario, describe_value
 
 _SOFTWARE = """@software{{trilat_net,
@@ -68,13 +67,13 @@ _STATEMENTS = {
 
 
 def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
-    """Yields a paragraph for a paper about a run, and then its references as BibTeX.
+    """Yields a paragraph about a run for use in a paper, followed by its references as BibTeX.
 
-    The paragraph states the scenario, the judgement and its basis, and the program.
+    The paragraph states the scenario, the verdict and its basis, and the program.
 
     Args:
         log: The log of the run.
-        certificate: Judgement whether the run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     yield " ".join(_compose_sentences(log, certificate))
     yield ""
@@ -85,10 +84,10 @@ def compose_citation(log: Log, certificate: Certificate) -> Iterator[str]:
 
 
 def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
-    """Yields the sentences of a paragraph, for a paper, about a run and its stability.
+    """Yields the sentences of a paragraph about a run and its stability, for use in a paper.
 
-    The sentences state the scenario, the control laws and delays, the judgement and its basis,
-    the methods that were used (with their citations), and the state of the log.
+    The sentences state the scenario, the control laws and delays, the verdict and its basis,
+    the methods used (with citations), and the condition of the log.
     """
     scenario = log.scenario
     ticks = sum(len(log[site]) for site in log.sites)
@@ -137,29 +136,29 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
 
 
 def _state_settings(scenario: Scenario) -> Iterator[str]:
-    """Yields sentences for a paper on the control laws with their gains, and on the delays.
+    """Yields sentences for a paper on the delays and on the control laws with their gains.
 
-    Arms with the same law and gains share an entry, and so do network links with the same
-    delay.
+    Arms with the same law and gains share an entry, and so do links with the same delay.
     """
     law_texts = {}
     for name, site in scenario.sites.items():
         control = site.control
-        law = control.tag
         gains = msgspec.structs.asdict(control)
         code_note = ""
 
         # The law is a user's Python class. Its hash tells which version of the file was used.
-        if isinstance(control, ImportedLaw):
-            law = control.code
-            gains = control.settings
+        user_law = site.user_law
+        if user_law is not None:
+            gains = user_law.settings
             code_note = (
-                f", other settings as in its file (SHA-256 {control.source_sha256[:16]})"
+                f", other settings as in its file (SHA-256 {user_law.source_sha256[:16]})"
             )
 
         gains_text = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
         law_texts[name] = (
-            f"{law} ({gains_text}){code_note}" if gains_text else f"{law}{code_note}"
+            f"{site.law_name} ({gains_text}){code_note}"
+            if gains_text
+            else f"{site.law_name}{code_note}"
         )
 
     delay_texts = {name: link.describe() for name, link in scenario.links.items()}
@@ -172,9 +171,9 @@ def _state_settings(scenario: Scenario) -> Iterator[str]:
 
 
 def _group_equal(texts: Mapping[str, str]) -> str:
-    """Joins the texts about several objects, each with the names of its objects.
+    """Joins descriptions of several objects, merging equal ones and listing the object names.
 
-    If all texts are equal, the text is returned once, without names.
+    If all descriptions are equal, the description is returned once, without names.
     """
     names: dict[str, list[str]] = {}
     for name, text in texts.items():
@@ -185,7 +184,7 @@ def _group_equal(texts: Mapping[str, str]) -> str:
 
 
 def _format_commit() -> str:
-    """Returns the field of a BibTeX entry with the commit of this program. Empty if unknown."""
+    """Returns the BibTeX field with the commit of this program. Empty if unknown."""
     facts = collect_provenance()
     if facts["commit"] == "unknown":
         return ""
@@ -194,7 +193,7 @@ def _format_commit() -> str:
 
 
 def _list_sources(certificate: Certificate) -> list[str]:
-    """Returns the BibTeX entries of the papers whose methods a judgement has used."""
+    """Returns the BibTeX entries of the papers whose methods were used for a verdict."""
     sources = []
     if certificate.roots is not None and certificate.roots.verdict:
         sources.append(_ROOTS)

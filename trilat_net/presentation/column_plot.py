@@ -1,18 +1,17 @@
-"""Draws columns of a log over time, as the method `Log.plot` does.
+"""Plots columns of a log over time; this is the implementation of `Log.plot`.
 
 A column is one recorded quantity of an arm, such as the angle of its first joint. For example,
-`log.plot("q1", "tau1")` draws the angle and the torque of the first joint of all arms. A name
-selects one of
+`log.plot("q1", "tau1")` plots the angle and the torque of the first joint of every arm. A name
+can refer to
 
-- a quantity, such as "q", which stands for all columns of the quantity,
+- a quantity, such as "q", which selects all columns of the quantity,
 - a column without its unit, such as "q1",
 - a column, such as "q1_rad".
 
 Invariant:
-    - Names are those of the tables of the log (`Log.table`), and "e", the error.
-    - Each column has a panel. The panel contains a line for each selected arm that has the
-      column.
-    - An unknown name raises an error that lists the existing names.
+    - Names are those of the tables of the log (`Log.table`), and "e" for the error.
+    - There is one panel per column, with one line for each selected arm that has the column.
+    - An unknown name raises an error that lists the valid names.
 """
 
 import re
@@ -36,30 +35,29 @@ from .figures.registry import FIGURES
 from .figures.run_overview import draw_overview
 
 DEFAULT_QUANTITIES = ("q", "e", "tau")
-"""Quantities of a plot for which sites, joints or times are selected, but no columns."""
+"""Quantities to plot if sites, joints or times are selected, but no columns."""
 _JOINT_QUANTITIES = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "e")
-"""Quantities that have a column per joint, named after the number of the joint."""
+"""Quantities with one column per joint, named after the number of the joint."""
 _QUANTITIES_BY_SOURCE = {"ch.": "ch", "used.": "used", "t_ns, used.": "age"}
-"""Quantities with a column per peer or per vector, by the first letters of a column's source.
-"""
+"""Quantities with one column per peer or vector, keyed by the prefix of the column's source."""
 _MARGIN_IN = 0.7
 """Height of the time axis and the legend, in inches."""
 _ROW_IN = 1.25
 """Height of a row of panels, in inches."""
 
 Joints = int | str | Sequence[int | str] | None
-"""Joints by number, counted from 1, or by name. `None` for all joints."""
+"""Joint numbers, counted from 1, or joint names. `None` for all joints."""
 
 
 class _Line(NamedTuple):
-    """Values over time of one table column of an arm, which a figure draws as a line.
+    """One table column of an arm over time, plotted as a line.
 
-    A panel of the figure has such a line for each arm that has the column.
+    A panel has one such line for each arm that has the column.
 
     Attributes:
         site: Name of the site.
         tick: Numbers of the ticks, shape (K,).
-        t_s: Times of the ticks, shape (K,), in s.
+        t_s: Times of the ticks, in s, shape (K,).
         column: The column, with K rows.
     """
 
@@ -70,7 +68,7 @@ class _Line(NamedTuple):
 
 
 _Panels = dict[str, list[_Line]]
-"""The lines of each panel, by the name of the column."""
+"""Mapping from column name to the lines of its panel."""
 
 
 def plot_log(
@@ -82,22 +80,22 @@ def plot_log(
     from_s: float | None = None,
     until_s: float | None = None,
 ) -> Figure:
-    """Draws columns of a log over time, with a panel per column and a line per arm.
+    """Plots columns of a log over time, with one panel per column and one line per arm.
 
-    For example, `plot_log(log, ["q1", "tau1"])` draws the angle and the torque of the first
-    joint of all arms. If nothing is selected, the figure is the overview of the run.
+    For example, `plot_log(log, ["q1", "tau1"])` plots the angle and the torque of the first
+    joint of every arm. If nothing is selected, the figure is the overview of the run.
 
     Args:
         log: The log.
         names: Names of quantities or columns. Each name gets its own rows of panels.
-        sites: Names of the arms. `None` for all arms.
-        joints: Joints to draw, for quantities with a column per joint.
-        from_s: First time that is drawn, in s. `None` for the start of the run.
-        until_s: Last time that is drawn, in s. `None` for the end of the run.
+        sites: Names of the arms to plot. `None` for all arms.
+        joints: Joints to plot, for quantities with one column per joint.
+        from_s: Start of the plotted interval, in s. `None` for the start of the run.
+        until_s: End of the plotted interval, in s. `None` for the end of the run.
 
     Raises:
         UnknownName: There is no such column, arm or joint.
-        UsageError: The interval of time contains no records.
+        UsageError: The interval contains no records.
         LogError: The records cannot be read.
     """
     is_restricted = not (
@@ -118,11 +116,11 @@ def plot_log(
 
 
 def _select_sites(log: Log, sites: str | Iterable[str] | None) -> list[str]:
-    """Returns the arms that a user selected for a figure, in the order of the scenario.
+    """Returns the sites that a user selected for a figure, in scenario order.
 
     Args:
         log: The log.
-        sites: Name or names of the arms' sites. `None` selects all.
+        sites: Name or names of the sites. `None` selects all.
 
     Raises:
         UnknownName: A site does not exist.
@@ -141,7 +139,7 @@ def _select_sites(log: Log, sites: str | Iterable[str] | None) -> list[str]:
 def _check_interval(
     log: Log, from_s: float | None, until_s: float | None
 ) -> tuple[float, float]:
-    """Checks the interval of time that a user selected for a figure.
+    """Validates the time interval that a user selected for a figure.
 
     Args:
         log: The log.
@@ -149,11 +147,10 @@ def _check_interval(
         until_s: End, in s. `None` for the end of the log.
 
     Returns:
-        The first and the last time to draw, in s.
+        The start and end of the interval, in s.
 
     Raises:
-        UsageError: The first time is not before the last time, or the log ends before the first
-            time.
+        UsageError: The interval is empty or contains no records.
     """
     end_s = Timeline(log).end_s
     first_s = 0.0 if from_s is None else float(from_s)
@@ -172,10 +169,10 @@ def _check_interval(
 
 
 def _list_columns(log: Log, site: str) -> list[Column]:
-    """Returns everything of a site that can be plotted: columns of its records, and its error.
+    """Returns everything that can be plotted for a site: its record columns and its error.
 
     The error e is the deviation from the reference that the control law acts on. It is not
-    stored in the log, and therefore not among the columns of its table.
+    stored in the log, and therefore not a column of its table.
     """
     columns = [*log.table(site).columns]
     arm = log.scenario.arms[site]
@@ -205,7 +202,7 @@ def _list_columns(log: Log, site: str) -> list[Column]:
 def _get_quantity(column: Column) -> str:
     """Returns the name of the quantity to which a column belongs, such as "q" for "q1_rad".
 
-    A column that is a quantity by itself returns its name without the unit.
+    For a column that is a quantity of its own, this is the column name without the unit.
     """
     for start, quantity in _QUANTITIES_BY_SOURCE.items():
         if column.source.startswith(start):
@@ -221,10 +218,9 @@ def _get_stem(column: Column) -> str:
 
 
 def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) -> _Panels:
-    """Returns the lines to draw for a name: one for each matching column of each site.
+    """Returns the lines selected by a name: one for each matching column of each site.
 
-    A column is a quantity in the records of a run, such as the joint angles. A name may select
-    several columns.
+    A name may select several columns, for example all joint angles.
 
     Args:
         log: The log.
@@ -233,7 +229,7 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
             "q1_rad".
 
     Returns:
-        The lines of each panel, by the name of its column.
+        Mapping from column name to the lines of its panel.
 
     Raises:
         UnknownName: The name selects no column.
@@ -253,7 +249,7 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
 def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
     """Returns the error message for an unknown column, which suggests a similar name.
 
-    A similar name is suggested because the user has probably misspelled the name.
+    The user has probably misspelled the name.
     """
     if name in FIGURES:
         return (
@@ -277,10 +273,10 @@ def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) ->
 
 
 def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
-    """Returns the numbers, from 1, of the selected joints that exist at the arm of a site.
+    """Returns the numbers, starting from 1, of the selected joints of a site's arm.
 
-    A selection consists of numbers and names of joints, or of a single number or name. Numbers
-    and names that the arm does not have are ignored.
+    A selection is a joint number or name, or several of them. Joints that the arm does not have
+    are ignored.
 
     Args:
         log: The log.
@@ -301,11 +297,11 @@ def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
 
 
 def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
-    """Checks that each joint that a user selected for a figure exists at some selected arm.
+    """Raises UnknownName if a selected joint does not exist in any of the selected arms.
 
     Args:
         log: The log.
-        sites: Names of the selected arms' sites.
+        sites: Names of the selected sites.
         joints: The selected joints.
 
     Raises:
@@ -328,14 +324,14 @@ def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
 
 
 def _filter_joints(log: Log, name: str, panels: _Panels, joints: Joints) -> _Panels:
-    """Removes the table columns of joints that the user did not select for the figure.
+    """Removes the columns of joints that the user did not select for the figure.
 
-    Columns that belong to no joint, such as the age of a sample, are kept.
+    Columns that do not belong to a joint, such as the age of a sample, are kept.
 
     Args:
         log: The log.
-        name: Name that selected the columns, for the error.
-        panels: The lines by the name of the column.
+        name: Name that selected the columns, for the error message.
+        panels: Mapping from column name to lines.
         joints: The selected joints.
 
     Raises:
@@ -361,7 +357,7 @@ def _filter_joints(log: Log, name: str, panels: _Panels, joints: Joints) -> _Pan
 
 
 def _get_joint_number(column: Column) -> int | None:
-    """Returns the number of the joint to which a column belongs. `None` for other columns."""
+    """Returns the number of the joint to which a column belongs, or `None` if there is none."""
     quantity = _get_quantity(column)
     if quantity not in _JOINT_QUANTITIES:
         return None
@@ -375,13 +371,13 @@ def _draw_groups(
     sites: Sequence[str],
     interval_s: tuple[float, float],
 ) -> Figure:
-    """Draws groups of panels below each other in one figure, each group in new rows.
+    """Draws groups of panels below each other in one figure, starting each group in a new row.
 
     Args:
         log: The log.
-        groups: The lines of each group, by the name of their column.
+        groups: For each group, a mapping from column name to lines.
         sites: Names of all selected sites.
-        interval_s: First and last time to draw, in s.
+        interval_s: Start and end of the time axis, in s.
     """
     largest_group = max(len(group) for group in groups)
     column_count = 1
@@ -432,15 +428,13 @@ def _draw_panel(
     lines: Sequence[_Line],
     interval_s: tuple[float, float],
 ) -> None:
-    """Draws a column of several sites in a panel.
-
-    The curves of the sites share the panel, so that they can be compared.
+    """Draws a column of several sites in one panel, so that they can be compared.
 
     Args:
         plot: The figure.
         axes: The panel.
         lines: The lines.
-        interval_s: First and last time to draw, in s.
+        interval_s: Start and end of the time axis, in s.
     """
     first_s, last_s = interval_s
     column = lines[0].column
@@ -465,10 +459,10 @@ def _draw_panel(
 
 
 def _list_words(lines: Sequence[_Line]) -> list[str]:
-    """Returns the distinct texts of a column of texts, which label the ticks of the value axis.
+    """Returns the distinct strings in a string column, which label the value axis.
 
-    The list is empty for a column of numbers. The modes of the control loop are sorted by the
-    numbers that represent them in messages for viewers. Other texts follow in alphabetical
+    The list is empty for a numerical column. The modes of the control loop are sorted by the
+    numbers that represent them in messages for viewers. Other strings follow in alphabetical
     order.
     """
     words: set[str] = set()
@@ -484,14 +478,14 @@ def _list_words(lines: Sequence[_Line]) -> list[str]:
 
 
 def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:
-    """Returns the values of a column as numbers to draw, shape (K,). NaN marks a missing value.
+    """Returns the values of a column as numbers to plot, shape (K,). NaN marks a missing value.
 
-    Texts, such as the mode of an arm, are replaced by their positions in a list of all texts.
+    Strings, such as the mode of an arm, are replaced with their index in a list of all strings.
 
     Args:
         column: The column.
-        words: The distinct texts of the column, each of which is drawn at its index. Empty for
-            a column of numbers.
+        words: The distinct strings in the column, each of which is drawn at its index. Empty
+            for a numerical column.
     """
     if not words:
         return np.asarray(column.numbers(), dtype=np.float64)

@@ -1,13 +1,13 @@
-"""Concludes a finished run: checks its log, and writes its report and its summary.
+"""Wraps up a finished run: checks its log, and writes its report and its summary.
 
-`conclude` does the work of `trilat report`. To check the log, it computes the control loops
-again from the received data in the log, and compares the results with the log, bit for bit. The
-result is a `Conclusion`, whose text the commands print after a run.
+`conclude` implements `trilat report`. To check the log, it recomputes the control loops from
+the received data in the log and compares the results with the recorded ones bit for bit. It
+returns a `Conclusion`, whose text the commands print after a run.
 
 Invariant:
-    - Every claim rests on a new execution of the log that was made for this conclusion.
-    - The execution runs in another process while the report is written, so that two processor
-      cores are used.
+    - Every claim is based on a re-execution of the log made for this conclusion.
+    - The re-execution runs in a separate process while the report is written, which makes use
+      of two processor cores.
 """
 
 from collections.abc import Iterator, Sequence
@@ -39,18 +39,18 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """Text and files with which a finished run is presented to its user.
+    """Text and files that present a finished run to the user.
 
-    `conclude` creates this object after a run was recorded.
+    Created by `conclude` after a run was recorded.
 
     Attributes:
-        verdict: Judgement whether the run was stable.
-        meaning: Lines that explain the judgement, with remarks about the run.
-        table: Table with a row for each arm.
-        notes: Lines about notable facts of the run, such as changed settings or messages of a
-            user's control law, and about the proof of stability.
-        findings: Results of the checks of the log, one per check.
-        paths: Files of the log, and files that were written.
+        verdict: The verdict on whether the run was stable.
+        meaning: Lines that explain the verdict, with remarks about the run.
+        table: Table with one row per arm.
+        notes: Lines about the stability proof and about notable facts of the run, such as
+            changed settings or messages from a user's control law.
+        findings: Results of the log checks, one per check.
+        paths: Log files, and files that were written.
     """
 
     verdict: CertificateLine
@@ -61,10 +61,10 @@ class Conclusion(CheckReport):
     meaning: list[CertificateLine] = field(default_factory=list)
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat report` prints.
+        """Yields the blocks of text that `trilat report` prints.
 
-        The parts are the judgement about stability and its meaning, the checks of the log, the
-        table of sites, the notes, and the paths of the files.
+        These are the stability verdict and its explanation, the checks of the log, the table of
+        sites, the notes, and the paths of the files.
         """
         for line in (self.verdict, *self.meaning):
             yield line.print_form
@@ -79,36 +79,36 @@ class Conclusion(CheckReport):
 
     @property
     def page(self) -> Path:
-        """File that the user should open first: the HTML report of the run.
+        """Path of the file that the user should open first: the HTML report of the run.
 
-        If no report was written, it is the path of the first log file.
+        If no report was written, this is the path of the first log file.
         """
         pages = [path for path in self.paths if path.suffix == ".html"]
         return pages[0] if pages else self.paths[0]
 
     def headline(self) -> str:
-        """Returns a line that says whether the log passed its checks, with the report's path.
+        """Returns a line with the outcome of the log checks and the path of the report.
 
-        Some checks may be incomplete, because they need the code of a user's control law that
-        may not run. The line then says that not everything was judged.
+        Checks that need the code of a user's control law are incomplete if that code is not
+        allowed to run. In that case the line says that not everything was judged.
         """
         results = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
         result = results.get(self.exit_code, "FAILED")
         return f"{result}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
-        """Returns the table of the arms, one dictionary per arm.
+        """Returns the table of arms as a list of dictionaries, one per arm.
 
-        The keys are the headers of the columns. The values are texts, as in the terminal.
+        Keys are the column headers. Values are strings, as in the terminal.
         """
         headers = self.table.headers
         return [dict(zip(headers, row, strict=False)) for row in self.table.rows]
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat report --json` prints them.
+        """Converts the result to the plain values that `trilat report --json` prints.
 
-        The entries contain the outcome ("passed", "verdict"), its explanation for users
-        ("meaning", "notes"), the individual checks, and the paths of the files.
+        The entries are the outcome ("passed", "verdict"), its explanation for users ("meaning",
+        "notes"), the individual checks, and the paths of the files.
         """
         return {
             "passed": self.passed,
@@ -128,21 +128,21 @@ def conclude(
     min_coverage: float = MIN_COVERAGE,
     png: bool = False,
 ) -> Conclusion:
-    """Checks the log of a finished run, judges the run, and writes its report into a folder.
+    """Checks the log of a finished run, judges the run, and writes its report to a folder.
 
-    The checks execute the log again in a second process, while this process judges the run and
-    draws the figures.
+    The log is re-executed in a second process while this process judges the run and draws the
+    figures.
 
     Args:
         log: Log that was opened from files.
-        folder: Existing folder.
+        folder: Existing folder for the report.
         progress: Function that is called with the number of drawn figures and the total number.
-        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
-            recorded and checked for a judgement.
+        min_coverage: Minimum fraction of each site's ticks that must be recorded and checked
+            for the run to be judged.
         png: True to write the figures as PNG files too.
 
     Returns:
-        The judgement, the checks and the written files.
+        The verdict, the results of the checks, and the paths of the written files.
 
     Raises:
         LogError: A record cannot be read.
@@ -174,12 +174,12 @@ def conclude(
             )
 
         def wait_for_findings() -> Iterator[Finding]:
-            """Yields the result of each check of the log, once the checks have finished.
+            """Yields the result of each log check once all checks have finished.
 
-            The checks run in another process, which executes the log again. `check` is the
-            future of their results. This generator waits for them only when the first result is
-            requested, so that the report can be prepared meanwhile. The results are also stored
-            in the list `findings`, which is empty until then.
+            The checks run in another process, which re-executes the log; `check` is the future
+            for their results. This generator blocks only when the first result is requested, so
+            the report can be prepared in the meantime. It also stores the results in the list
+            `findings`, which is empty until then.
 
             Raises:
                 RunFailed: The other process was terminated.
@@ -220,7 +220,7 @@ def conclude(
 
 
 def _run_without_operators(log: Log) -> Log | None:
-    """Simulates the run of a log again without the people or programs that moved the arms.
+    """Repeats the run of a log in simulation, without operators.
 
     The difference between the two runs shows how far the operators displaced the arms.
 
@@ -245,14 +245,14 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
-    """Returns a table with a row per arm: number of records, timing, and largest final error.
+    """Returns a table with one row per arm: number of records, timing, and largest final error.
 
-    The error is the largest error of any joint in the last second, or of the whole run if the
-    run was shorter. The table names the joint.
+    The error is the largest error of any joint in the last second, or in the whole run if it
+    was shorter. The table names the joint.
 
     Args:
         log: Log of the run.
-        is_timed: False to leave out the timing. Loops in virtual time are never late.
+        is_timed: False to omit the timing, since loops in virtual time are never late.
     """
     timing_headers = _TIMING_HEADERS if is_timed else ()
     has_second = any(log[site].t_s[-1] >= END_WINDOW_S for site in log.sites if len(log[site]))
@@ -282,7 +282,7 @@ def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
 
 
 def _list_timing_cells(records: SiteLog) -> list[str]:
-    """Returns the percentiles of the lateness and of the computing time of a site's ticks."""
+    """Returns cells with percentiles of the lateness and computing time of a site's ticks."""
     late_us = np.percentile(records.late_us, (50, 99, 100))
     busy_us = np.zeros(2)
     # A record contains the computing time of the previous tick, so the first record has none.
@@ -294,18 +294,18 @@ def _list_timing_cells(records: SiteLog) -> list[str]:
 def conclude_files(
     paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
 ) -> tuple[Log, Conclusion]:
-    """Checks a log that was just recorded, writes its report, and prints the result.
+    """Checks a newly recorded log, writes its report, and prints the result.
 
-    If the user interrupts the work, a note gives the command that writes the report later.
+    If the user interrupts this, a note shows the command that writes the report later.
 
     Args:
         paths: Files of the log.
-        folder: Folder of the report.
+        folder: Folder for the report.
         as_json: True to print the result as JSON.
         png: True to write the figures as PNG files too.
 
     Returns:
-        The log, and the result of the checks with the paths of the report.
+        The log, and its conclusion with the paths of the report.
     """
     if not as_json:
         terminal_output.out.print("checking the log and drawing ...")

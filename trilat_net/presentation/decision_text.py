@@ -1,11 +1,11 @@
-"""Writes the sentences on the basis of a stability decision, and on the obstacles to it.
+"""Turns the basis of a stability decision, and the obstacles to it, into sentences.
 
-`analysis.stability_decision` decides and returns names, and the evidence with its numbers. For
-example, this module states the basis "roots" as "exact roots, slowest -0.832 /s".
+`analysis.stability_decision` makes the decision and returns names with numerical evidence. This
+module describes, for example, the basis "roots" as "exact roots, slowest -0.832 /s".
 
 Invariant:
-    - Each name of a basis has exactly one function in `BASES`, and each name of an obstacle
-      exactly one function in `OBSTACLES`.
+    - Each basis has exactly one function in `BASES`, and each obstacle exactly one function in
+      `OBSTACLES`.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,7 +22,7 @@ def _state_basis(decision: decision_facts.StabilityDecision) -> str:
 
 
 def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
-    """Returns sentences on all reasons that prevent a better decision.
+    """Returns one or more sentences for each reason that prevents a better decision.
 
     Empty if the run is stable.
     """
@@ -35,7 +35,7 @@ def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
 
 
 def _describe_roots(roots: decision_facts.LoopRoots) -> str:
-    """Returns a sentence on the roots at the end of a run, or on why there are none."""
+    """Returns a sentence on the roots at the end of a run, or on why they are missing."""
     if not roots.verdict:
         return f"this rest: no roots: {roots.reason}"
     if roots.rate_per_s is None:
@@ -50,7 +50,7 @@ def _describe_roots(roots: decision_facts.LoopRoots) -> str:
 
 
 def _describe_span(roots: decision_facts.LoopRoots) -> str:
-    """Returns a clause on the ticks and delays over which the roots were computed."""
+    """Returns a clause on the ticks and delays for which the roots were computed."""
     if roots.is_continuous:
         ages = ", of the mean ages" if roots.has_mean_ages else ""
         return f", in continuous time{ages}"
@@ -60,16 +60,16 @@ def _describe_span(roots: decision_facts.LoopRoots) -> str:
 def describe_tick_span(
     span_s: float | None, deviation_per_s: float | None, *, repeats: bool
 ) -> str:
-    """Returns a clause on the time for which the roots of a sampled loop were computed.
+    """Returns a clause on the time span for which the roots of a sampled loop were computed.
 
-    If the controllers compute in ticks (periods of the control loop) that are not all alike,
-    the roots belong to a span of several ticks.
+    If the ticks of the controllers are not all alike, the roots describe a span of several
+    ticks.
 
     Args:
-        span_s: The time, in s. None if all ticks are alike.
-        deviation_per_s: Uncertainty of the rate due to delays that do not repeat, in 1/s. None
-            if they nearly repeat.
-        repeats: True if the delays repeat after this time.
+        span_s: The time span, in s. None if all ticks are alike.
+        deviation_per_s: Uncertainty of the rate caused by delays that do not repeat exactly, in
+            1/s. None if they nearly repeat.
+        repeats: True if the delays repeat after this span.
 
     Returns:
         The clause, with a leading comma. Empty if all ticks are alike.
@@ -84,10 +84,10 @@ def describe_tick_span(
 
 
 def describe_left_out(roots: decision_facts.LoopRoots) -> str:
-    """Returns a phrase about the programs whose reaction the linear analysis leaves out.
+    """Returns a phrase about programs whose reaction the linear analysis ignores.
 
-    A program that moves an arm can be any code, which cannot be linearised. The phrase is empty
-    if there is no such program.
+    A program that moves an arm can run arbitrary code, which cannot be linearised. The phrase
+    is empty if there is no such program.
 
     Args:
         roots: The roots of the loop.
@@ -100,11 +100,11 @@ def describe_left_out(roots: decision_facts.LoopRoots) -> str:
 
 
 def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:
-    """Returns the phrase after "rests on:" if the roots of the loop decide.
+    """Returns the phrase after "rests on:" for decisions based on the roots of the loop.
 
-    For example "exact roots, slowest -0.832 /s": the mode that decays most slowly has the rate
-    of -0.832 per second. If the roots refute stability, the fastest growing mode is named
-    instead. Without a root that is not zero, the phrase has no rate.
+    For example, "exact roots, slowest -0.832 /s" means that the slowest mode decays at a rate
+    of 0.832 per second. If the roots refute stability, the fastest growing mode is named
+    instead. If all roots are zero, the phrase contains no rate.
     """
     name = "roots by numerical derivatives" if roots.is_numerical else "exact roots"
     if roots.rate_per_s is None:
@@ -124,7 +124,7 @@ def _state_roots(run: decision_facts.RunFindings) -> str:
 
 
 def _state_proofs(run: decision_facts.RunFindings) -> str:
-    """Returns phrases that name every proof of a stable loop, exact roots last."""
+    """Returns phrases that name every proof of stability, with exact roots last."""
     proofs = [THEOREM] if run.is_covered else []
     proofs += run.law_proofs
     if run.roots is not None and run.roots.is_proof:
@@ -133,9 +133,9 @@ def _state_proofs(run: decision_facts.RunFindings) -> str:
 
 
 def _state_pushes(run: decision_facts.RunFindings) -> str:
-    """Returns the basis of a settled run: the number of pushes, and why there is no proof.
+    """Returns the basis for a settled run: the number of pushes, and why there is no proof.
 
-    For example "8 pushes over 12 s, all of which died away; its roots are not exact".
+    For example: "8 pushes over 12 s, all of which died away; its roots are not exact".
     """
     assert run.twins is not None
     pushes = len({growth.push.name for growth in run.twins.pushes})
@@ -168,7 +168,7 @@ BASES: dict[decision_facts.Basis, Callable[[decision_facts.RunFindings], str]] =
     "growing pushes": _describe_twins,
     "dying pushes": _state_pushes,
 }
-"""For each basis of a decision, the function that writes its phrase."""
+"""For each basis of a decision, the function that describes it in a phrase."""
 
 
 def _list_missing_records(run: decision_facts.RunFindings) -> list[str]:
@@ -176,7 +176,7 @@ def _list_missing_records(run: decision_facts.RunFindings) -> list[str]:
 
 
 def _describe_period(run: decision_facts.RunFindings) -> list[str]:
-    """Returns a sentence for repetitions that were shorter than the period of the delays.
+    """Returns a sentence about repetitions that were shorter than the period of the delays.
 
     Pushes that died away then prove little, because the delays in the rest of the period were
     never tested.
@@ -238,16 +238,16 @@ OBSTACLES: dict[decision_facts.Obstacle, Callable[[decision_facts.RunFindings], 
     "few bursts": _describe_few_bursts,
     "unclear end": lambda run: [run.end.text],
 }
-"""For each obstacle, the function that writes its sentences. `_list_reasons` itself writes the
-sentence on a short record.
+"""For each obstacle, the function that describes it in sentences. The sentence about a short
+record is written by `_list_reasons` itself.
 """
 
 DESCRIBERS: dict[type, Callable[[Any], str]] = {
     decision_facts.StabilityDecision: _state_basis,
     decision_facts.LoopRoots: _describe_roots,
 }
-"""The functions that describe the findings of this module, by the class of the finding."""
+"""Functions that describe findings, keyed by the class of the finding."""
 SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
     decision_facts.StabilityDecision: _list_reasons
 }
-"""The function that lists the reasons of a decision, by its class."""
+"""Function that lists the reasons for a decision, keyed by the class of the decision."""

@@ -1,11 +1,11 @@
-"""Writes the sentences for users on the motion at the end of a run.
+"""Describes the motion at the end of a run in sentences for users.
 
-`analysis.run_end` judges the motion and returns names and numbers. This module writes them as
+`analysis.run_end` judges the motion and returns names and numbers. This module turns them into
 sentences, for example "converged: largest |e| 0.001 rad and |qd| 0.0002 rad/s in the last
 second".
 
 Invariant:
-    - Each name of a doubt has exactly one template in `END_DOUBTS`.
+    - Each kind of doubt has exactly one template in `END_DOUBTS`.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,7 +14,7 @@ from typing import Any
 from ..analysis import SETTLED_ERROR_RAD, EndBehaviour, EnvelopeTrend, RunEnd
 
 _LASTING_ERRORS = "at rest, with remaining errors"
-"""Phrase for arms that are slow, but whose errors exceed the limit of settled sites."""
+"""Phrase for arms that are slow but whose errors exceed the limit for settled sites."""
 END_DOUBTS = {
     "sites apart": (
         "{sites[0]} and {sites[1]} stand {distance_rad:.3g} rad apart, and nothing holds them "
@@ -28,7 +28,7 @@ END_DOUBTS = {
     "loop changes": "the loop changes until {until_s:.4g} s, within the judged part",
     "operator acts": "an operator acts until {until_s:.4g} s, within the judged part",
 }
-"""For each name of a doubt, the template of its sentence."""
+"""For each kind of doubt, the template of its sentence."""
 _TRENDS = {
     EnvelopeTrend.DECAYS: "decays",
     EnvelopeTrend.HARDLY: "hardly decays",
@@ -39,15 +39,15 @@ _TRENDS = {
 
 
 def _describe_end(end: RunEnd) -> str:
-    """Returns a sentence on how the motion of a run ends, with the numbers that show it.
+    """Returns a sentence on how the motion of a run ends, with the supporting numbers.
 
-    The sentence also contains the reasons why the run cannot be called stable.
+    The sentence also states the reasons why the run cannot be called stable.
     """
     return "; ".join([_describe_behaviour(end), *_list_doubts(end)])
 
 
 def _list_doubts(end: RunEnd) -> list[str]:
-    """Returns a sentence for each doubt about the end of a run. Empty if there is none."""
+    """Returns a sentence for each doubt about the end of a run. Empty if there are none."""
     sentences = []
     for doubt in end.doubts:
         sentence = END_DOUBTS[doubt.name].format(
@@ -60,13 +60,13 @@ def _list_doubts(end: RunEnd) -> list[str]:
 
 
 def name_behaviour(end: RunEnd) -> str:
-    """Returns a phrase for the behaviour at the end, such as "converged" or "growing".
+    """Returns a phrase for the behaviour at the end of a run, such as "converged" or "growing".
 
-    If the arms rest, but with synchronisation errors above the limit of settled sites, the
+    If the arms are at rest but synchronisation errors exceed the limit for settled sites, the
     phrase says that errors remain.
 
     Args:
-        end: How the motion ends.
+        end: The motion at the end of the run.
     """
     has_converged = end.behaviour is EndBehaviour.CONVERGED
     if has_converged and end.end_error_rad > SETTLED_ERROR_RAD:
@@ -77,7 +77,7 @@ def name_behaviour(end: RunEnd) -> str:
 
 
 def _describe_behaviour(end: RunEnd) -> str:
-    """Returns a sentence on how a run ends, with the numbers that show it."""
+    """Returns a sentence on how a run ends, with the supporting numbers."""
     behaviour = end.behaviour
     if end.diverged_at_s is not None:
         unnamed = f"a joint passed its qd_limit_rad_s at {end.diverged_at_s:.4g} s"
@@ -113,7 +113,7 @@ def _describe_behaviour(end: RunEnd) -> str:
 def _format_rate(trend: EnvelopeTrend, rate_per_s: float) -> str:
     """Returns the rate at which an amplitude grows or decays, such as "+0.12/s".
 
-    An amplitude without a clear rate gives a phrase such as "steady".
+    For an amplitude without a clear rate, this is a phrase such as "steady".
     """
     if trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED):
         return _TRENDS[trend]
@@ -121,6 +121,6 @@ def _format_rate(trend: EnvelopeTrend, rate_per_s: float) -> str:
 
 
 DESCRIBERS: dict[type, Callable[[Any], str]] = {RunEnd: _describe_end}
-"""The functions that describe the findings of this module, by the class of the finding."""
+"""Functions that describe findings, keyed by the class of the finding."""
 SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {RunEnd: _list_doubts}
-"""The functions that list the sentences of a finding, by its class."""
+"""Functions that list the sentences of a finding, keyed by the class of the finding."""

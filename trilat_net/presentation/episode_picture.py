@@ -1,12 +1,13 @@
-"""Draws the arms at one time of an episode, as an array of pixels for a video.
+"""Draws the arms at one moment of an episode as a pixel array, for use in a video.
 
-An episode is one attempt of a learned program at a task, see `trilat_studies`. A picture has
-one panel per arm. One of the panels also shows the goal of the task.
+An episode is one attempt of a learned program at a task, see `trilat_studies`. The picture has
+one panel per arm, and one of the panels also shows the goal of the task.
 
 Invariant:
-    - A picture depends only on the poses of the arms, the goal of the task and the title.
-    - All pictures of an episode have the same size and the same axis limits, so that only arms
-      and bodies move in the video.
+    - A picture depends only on the poses of the arms and bodies, the goal of the task, and the
+      title.
+    - All pictures of an episode have the same size and axis limits, so that only arms and
+      bodies move in the video.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ..analysis import joint_positions_m
+from ..analysis import build_arm_rows
 from ..core import Array
 from ..scenario import Scenario
 from . import style
@@ -26,10 +27,10 @@ from .appearance import SITE_COLOURS
 from .figures.arm_poses import project_arm_m, trace_bodies_m
 
 PANEL_PX = 240
-"""Side of a panel, in pixels."""
+"""Side length of a panel, in pixels."""
 _DPI = 100
 _MARGIN = 1.08
-"""Half the side of a panel, as a multiple of the reach of its arm."""
+"""Half the side length of a panel, as a multiple of the reach of its arm."""
 _GOAL: dict[str, Any] = {
     "marker": "x",
     "markersize": 9.0,
@@ -45,9 +46,7 @@ _BASE: dict[str, Any] = {
 
 
 class EpisodePicture:
-    """Draws pictures of the arms in a learning episode, one after another, into one figure.
-
-    An episode is one attempt of a learning program at a task.
+    """Draws successive pictures of the arms in a learning episode, reusing one figure.
 
     Args:
         scenario: Scenario of the task, with the arms.
@@ -58,6 +57,7 @@ class EpisodePicture:
         self._scenario = scenario
         self._goal_site = goal_site
         names = scenario.names
+        self._arms = {site: build_arm_rows(scenario, site) for site in names}
         side_in = PANEL_PX / _DPI
         width_in = PANEL_PX * len(names) / _DPI
         self._figure = Figure(figsize=(width_in, side_in), dpi=_DPI)
@@ -73,33 +73,31 @@ class EpisodePicture:
         goal_m: Array | None,
         title: str,
     ) -> NDArray[np.uint8]:
-        """Draws the arms, the bodies and the goal of the task at one time of an episode.
-
-        An episode is one attempt at a task. Its pictures can be combined to a video.
+        """Draws the arms, the bodies and the goal of the task at one moment of an episode.
 
         Args:
-            q_rad: Joint angles by site, in rad, shape (n,) each.
-            bodies: Poses of the bodies that the arms can touch, by site and name, shape (7,)
-                each.
-            goal_m: Position that the task requires, in m. `None` if the goal is not a position.
+            q_rad: Joint angles of each site, in rad, shape (n,) each.
+            bodies: For each site, the poses of the bodies that its arm can touch, keyed by body
+                name, shape (7,) each.
+            goal_m: Position required by the task, in m. `None` if the goal is not a position.
             title: Text in the lower left corner of the first panel.
 
         Returns:
-            Colours of the pixels (red, green, blue), shape (height, width, 3).
+            RGB pixels, shape (height, width, 3).
         """
         for number, (site, axes) in enumerate(self._panels.items()):
-            arm = self._scenario.arms[site]
+            arm = self._arms[site]
             colour = SITE_COLOURS[number % len(SITE_COLOURS)]
             q_rows_rad = np.asarray(q_rad[site])[np.newaxis]
-            points_m = joint_positions_m(arm, q_rows_rad)[0]
+            points_m = arm.joint_positions_m(q_rows_rad)[0]
 
             axes.clear()
             _scale_panel(axes, points_m)
             self._draw_bodies(axes, site, bodies.get(site, {}))
-            _draw_arm(axes, project_arm_m(arm, points_m), colour)
+            _draw_arm(axes, project_arm_m(arm.upright_axes, points_m), colour)
 
             if goal_m is not None and site == self._goal_site:
-                goal_in_picture = project_arm_m(arm, np.asarray(goal_m))
+                goal_in_picture = project_arm_m(arm.upright_axes, np.asarray(goal_m))
                 axes.plot(*goal_in_picture, **_GOAL)
             axes.text(0.03, 0.97, site, transform=axes.transAxes, va="top", fontsize=9.0)
 
@@ -115,18 +113,18 @@ class EpisodePicture:
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             site: Name of the site.
-            bodies: Pose of each body by name, shape (7,) each.
+            bodies: Mapping from body name to pose, shape (7,) each.
         """
         if not bodies:
             return
         poses = np.concatenate(list(bodies.values()))
         sizes_m = self._scenario.bodies_m(site).values()
-        arm = self._scenario.arms[site]
-        for path in trace_bodies_m(arm, sizes_m, poses[np.newaxis]):
+        arm = self._arms[site]
+        for path in trace_bodies_m(arm.upright_axes, sizes_m, poses[np.newaxis]):
             axes.plot(*path[0].T, color=style.REFERENCE, linewidth=0.8)
 
     def _read_pixels(self) -> NDArray[np.uint8]:
-        """Returns the pixels of the figure without their opacity."""
+        """Returns the RGB pixels of the figure, without the alpha channel."""
         self._canvas.draw()  # type: ignore[no-untyped-call]
         rgba = np.asarray(self._canvas.buffer_rgba())  # type: ignore[no-untyped-call]
         pixels: NDArray[np.uint8] = rgba[:, :, :3].copy()
@@ -136,11 +134,11 @@ class EpisodePicture:
 def _scale_panel(axes: Axes, points_m: Array) -> None:
     """Sets the axis limits of a panel so that the arm fits in every pose.
 
-    The limits are the reach of the arm, the sum of its links' lengths.
+    The limits are based on the reach of the arm, which is the sum of its link lengths.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        points_m: Base, joints and end effector in any pose, shape (L, 2) or (L, 3), in m.
+        points_m: Base, joints and end effector in any pose, in m, shape (L, 2) or (L, 3).
     """
     lengths_m = np.linalg.norm(np.diff(points_m, axis=0), axis=1)
     half_m = _MARGIN * float(lengths_m.sum())
@@ -149,11 +147,11 @@ def _scale_panel(axes: Axes, points_m: Array) -> None:
 
 
 def _draw_arm(axes: Axes, points_m: Array, colour: str) -> None:
-    """Draws the links, joints and base of an arm into a panel of a figure.
+    """Draws the links, joints and base of an arm in a panel.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        points_m: Base, joints and end effector in the picture, shape (L, 2), in m.
+        points_m: Base, joints and end effector in the picture, in m, shape (L, 2).
         colour: Colour of the arm.
     """
     axes.plot(*points_m.T, color=colour, linewidth=3.0, solid_capstyle="round")

@@ -1,14 +1,14 @@
-"""Exports a log to a file or folder that other tools read, such as CSV, MATLAB or Parquet.
+"""Exports a log to a file or folder for use in other tools, such as CSV, MATLAB or Parquet.
 
-Each format is a module of the folder `exports` with a constant `FORMAT`. `Exporter` finds the
-format by its name, checks its settings and the output path, and writes the export. Formats of
-tables share `store_tables`.
+Each format is a module in the folder `exports` with a constant `FORMAT`. `Exporter` looks up
+the format by name, checks its settings and the output path, and writes the export. Tabular
+formats share `store_tables`.
 
 Invariant:
-    - Numbers that are read back from an export equal those of the log, bit for bit.
-    - An export describes itself: its session, and the unit, meaning and source of every column.
-    - An export that is not possible is rejected before a log is read and before any file is
-      written.
+    - Numbers read back from an export equal those in the log, bit for bit.
+    - An export is self-describing: it contains the session, and the unit, meaning and source of
+      every column.
+    - An impossible export is rejected before a log is read or any file is written.
 """
 
 import inspect
@@ -25,24 +25,24 @@ from ..results import JsonObject
 from . import exports
 
 EXPORT_MANIFEST = "about.json"
-"""Name of the file that describes an exported folder and marks the folder as an export."""
+"""Name of the file that describes an exported folder and identifies it as an export."""
 Written = Callable[[int], None]
-"""Function that is called with the number of records written since its last call."""
+"""Function that is called with the number of records written since the last call."""
 
 
 class ExportFormat(NamedTuple):
     """A file format to which logs can be exported, such as CSV.
 
-    It is the constant `FORMAT` of a module in the folder `exports`.
+    Each module in the folder `exports` defines one as its constant `FORMAT`.
 
     Attributes:
-        write: Function that writes a log. Its arguments are the log (a list of logs if `many`
-            is True), the file or folder to write, and a function of type `Written` that reports
-            progress. Its keyword-only parameters are the settings of the format. It returns a
-            summary for the user, or `None`.
-        ending: End of the default output path, which begins with the name of the log.
+        write: Function that writes a log. It receives the log (a list of logs if `many` is
+            True), the file or folder to write, a progress callback of type `Written`, and the
+            settings of the format as keyword-only arguments. It returns a summary for the user,
+            or `None`.
+        ending: Suffix of the default output path, which is appended to the name of the log.
         folder: True if the format writes a folder.
-        extra: If the format needs an optional package, the arguments of `import_extra`: the
+        extra: If the format needs an optional package, the arguments for `import_extra`: the
             module, the extra that installs it, and the features that need it. Otherwise empty.
         many: True if the format accepts several logs.
     """
@@ -57,18 +57,18 @@ class ExportFormat(NamedTuple):
 class Exporter:
     """A prepared export of logs to a file or a folder.
 
-    Creating this object checks all arguments, so that a mistake is reported before the log is
-    read. `export` then writes the logs.
+    The constructor checks all arguments, so that mistakes are reported before the log is read.
+    `export` then writes the logs.
 
     Args:
         form: Name of the format.
-        path: The file or folder. `None` for a path next to the log, with the name of the log.
+        path: The file or folder to write. `None` for a path next to the log, named after it.
         force: True to replace an earlier export.
         log: Path of the log, or of its first part.
-        settings: Settings of the format by name, as a mapping or as pairs.
+        settings: Settings of the format, as a mapping from name to value or as pairs.
 
     Attributes:
-        path: The file or folder.
+        path: The file or folder to write.
 
     Raises:
         UsageError: There is no such format or setting, the path exists and `force` is False, or
@@ -104,7 +104,7 @@ class Exporter:
             import_extra(*self._format.extra)
 
     def export(self, *logs: Log, progress: Progress = lambda _done, _total: None) -> str:
-        """Writes recorded logs in another file format, for example as CSV tables.
+        """Writes the logs in the chosen format, for example as CSV tables.
 
         Args:
             *logs: The logs. Most formats accept only one.
@@ -112,12 +112,12 @@ class Exporter:
                 number.
 
         Returns:
-            The summary of the format for the user. Empty if the format has none.
+            Summary for the user. Empty if the format provides none.
 
         Raises:
             LogError: A record cannot be read.
             LogRefused: The disk is full.
-            UsageError: The path is not writable, or the format accepts a single log only.
+            UsageError: The path is not writable, or the format accepts only one log.
         """
         if len(logs) > 1 and not self._format.many:
             raise UsageError(
@@ -130,10 +130,10 @@ class Exporter:
         done = 0
 
         def report_written(records: int) -> None:
-            """Reports the progress of the export after further records have been written.
+            """Reports progress after more records have been written.
 
             Args:
-                records: Number of records that were written since the last call.
+                records: Number of records written since the last call.
             """
             nonlocal done
             done += records
@@ -150,13 +150,13 @@ def _parse_settings(
 ) -> dict[str, Any]:
     """Converts the settings of an export, such as `fps=30`, to the types of their parameters.
 
-    The settings come from the command line as texts. A format declares its settings as
-    keyword-only parameters of its function, with default values that determine the types.
+    Settings from the command line are strings. A format declares its settings as keyword-only
+    parameters of its function, whose default values determine the types.
 
     Args:
         form: Name of the format.
         write: Function of the format that writes a log.
-        settings: Values of settings by name, as numbers or texts.
+        settings: Mapping from setting name to a number or string.
 
     Returns:
         The converted settings by name.
@@ -197,17 +197,18 @@ def store_tables(
 ) -> str:
     """Stores every table of a log in an export, and returns a description of the export.
 
-    All formats share this loop. A format supplies two functions, which name and store a table.
-    For example, the NumPy format adds each column as an array to a dictionary.
+    This loop is shared by all formats. The format supplies one function that names a table and
+    one that stores it; the NumPy format, for example, adds each column to a dictionary of
+    arrays.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         written: Function that is called with the number of records of each table.
         choose_name: Function that returns the name of a table in the export.
         store: Function that stores a table under a name.
 
     Returns:
-        The description of the session and of all columns, as JSON text.
+        Description of the session and of all columns, as a JSON string.
     """
     tables = {}
     for table in log.tables():
@@ -239,12 +240,11 @@ def write_table_files(
 ) -> None:
     """Writes every table of a log to a separate file, for formats such as CSV and Parquet.
 
-    A description of all tables, and the scenario (the text that defines the run), are also
-    written to the folder.
+    The folder also receives a description of all tables, and the scenario.
 
     Args:
-        log: Log of the run that is exported.
-        folder: Existing folder of the files.
+        log: Log of the run to export.
+        folder: Existing folder for the files.
         written: Function that is called with the number of records of each table.
         suffix: Suffix of the files, for example ".csv".
         write_table: Function that writes a table to a file.
@@ -259,7 +259,7 @@ def write_table_files(
 
 
 def _describe_table(table: Table) -> JsonObject:
-    """Returns the meaning of a table's rows, and unit, meaning and source of its columns."""
+    """Returns the meaning of a table's rows, and unit, meaning and source of each column."""
     columns = {}
     for column in table.columns:
         columns[column.name] = {
@@ -271,12 +271,12 @@ def _describe_table(table: Table) -> JsonObject:
 
 
 def _describe_folder(log: Log, folder: Path, about: str) -> None:
-    """Writes files that explain an exported folder to its later readers.
+    """Writes files that explain an exported folder to later readers.
 
-    The files are a description of the columns, and the scenario of the run.
+    These are a description of the columns, and the scenario of the run.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         folder: The exported folder.
         about: Description of the export, from `store_tables`.
     """
@@ -287,13 +287,12 @@ def _describe_folder(log: Log, folder: Path, about: str) -> None:
 def name_inside(table: Table, name: str, separator: str) -> str:
     """Returns the name under which a table of a log is stored in an exported file.
 
-    A table with the records of a site (process that runs one arm) has the name of the site
-    alone. For further tables of the site, the kind of the table is added, as in "m1.link" for
-    the statistics of its links.
+    The table of a site's records is named after the site. Other tables of the site also include
+    the kind of table, as in "m1.link" for the statistics of its links.
 
     Args:
         table: Table of the log.
-        name: Name of the site, or of the table if it belongs to no site.
-        separator: Text between the name and the kind, such as ".".
+        name: Name of the site, or of the table if it does not belong to a site.
+        separator: String placed between the name and the kind, such as ".".
     """
     return name if table.kind in ("", "state") else f"{name}{separator}{table.kind}"

@@ -1,10 +1,10 @@
-"""Describes the findings of the analysis in sentences, by the class of the finding.
+"""Describes the findings of the analysis in sentences, depending on the class of the finding.
 
-The classes of `analysis` contain names and numbers, and their properties `text`, `reasons` and
+The classes of `analysis` contain names and numbers. Their properties `text`, `reasons` and
 `remarks` call the two functions of this module through hooks.
 
 Invariant:
-    - The functions of each class are in one module, in the tables `DESCRIBERS` and
+    - The functions for each class are in one module, in the tables `DESCRIBERS` and
       `SENTENCE_LISTERS`.
 """
 
@@ -36,21 +36,21 @@ _SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
 
 
 def describe_finding(finding: Any) -> str:
-    """Returns a sentence or phrase for users on a finding of the analysis.
+    """Returns a sentence or phrase that describes a finding of the analysis to users.
 
     Args:
-        finding: The finding, with the numbers that show it.
+        finding: The finding, with its numerical evidence.
     """
     return _DESCRIBERS[type(finding)](finding)
 
 
 def list_finding_sentences(finding: Any) -> list[str]:
-    """Returns the sentences on a finding that consists of several, one for each of its parts.
+    """Returns one sentence for each part of a finding that has several parts.
 
-    For example, the sentences say why the end of a run leaves its stability open.
+    For example, the sentences explain why the end of a run leaves its stability open.
 
     Args:
-        finding: The finding, with the numbers that show it.
+        finding: The finding, with its numerical evidence.
 
     Returns:
         The sentences. Empty if the finding has no parts.

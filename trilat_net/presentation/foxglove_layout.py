@@ -1,28 +1,34 @@
-"""Builds the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
+"""Writes the layout in which Foxglove and Lichtblick, two viewers for robot data, show a log.
 
-A layout is a JSON file that a user imports into the viewer. The file states which panels are
-shown, and which values of which topics they draw. The layout contains the plots of the layout
-for Rerun (`rerun_viewer.build_plot_layout`), the modes of the arms' controllers, the events,
-and the arms in space.
+The layout is a JSON file next to the log, which the user imports into the viewer. It also works
+for a ROS 2 bag exported from the log. It defines which panels are shown, and which fields of
+which topics they plot: the plots of the Rerun layout (`rerun_viewer.PlotLayout`), the modes of
+the arms' controllers, the events, and the arms in space.
 
-The topics of the live bridge to ROS 2 and of exported bags differ from those of logs. The
-layout of a log therefore has two tabs: one for the log itself, and one for a running session of
-the same scenario, which reaches the viewer over ROS 2.
+The live ROS 2 bridge and exported bags use different topics than logs do. The layout of a log
+therefore has two tabs: one for the log itself, and one for a running session of the same
+scenario, which the viewer accesses over ROS 2.
 
 Invariant:
-    - Each message path of the layout refers to a value that exists in the file or in the topics
+    - Each message path in the layout refers to a field that exists in the file or in the topics
       of the live bridge.
-    - Panels without data take no space.
-    - Equal channels give layouts with equal bytes.
+    - Panels without data take up no space.
+    - Equal channels produce byte-identical layouts.
+    - An existing file is replaced only with `force`.
 
-The format is that of files which the viewers export: `configById` contains the settings of each
-panel by its identifier, and `layout` is a binary tree of identifiers. Viewers ignore settings
-that they do not know.
+The file has the format that the viewers themselves export: `configById` maps panel identifiers
+to settings, and `layout` is a binary tree of identifiers. Viewers ignore settings that they do
+not know.
 """
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from ..errors import UsageError
+from ..files import refuse_existing, write_whole
+from ..log import open_log
 from ..log.ros2 import (
     FLOAT64_ARRAY,
     NUMBERS_BY_MODE_WORD,
@@ -31,37 +37,74 @@ from ..log.ros2 import (
     STRING,
     WORLD,
     Ros2Channels,
+    Ros2Topics,
 )
-from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
+from .rerun_viewer import CurvePlot, PlotLayout
 
+_LAYOUT_SUFFIX = ".foxglove.json"
+"""Suffix of a layout file, which replaces the suffix of the log."""
 _MODE = "mode"
-"""Name of the topic with the mode of a site."""
+"""Name of the topic that contains the mode of a site."""
 _MODE_NUMBERS = (_MODE, "mode_number")
-"""Names of the topics with the number of a mode, which are shown in a special kind of panel."""
+"""Names of the topics that contain mode numbers, which are shown in a special kind of panel."""
 _PLOTS_PERCENT = 75.0
-"""Height of the plots, above modes and events, as a percentage of the total height."""
+"""Height of the plots, which are above modes and events, as a percentage of the total height.
+"""
 _MODES_PERCENT = 60.0
-"""Width of the modes, beside events, as a percentage of the total width."""
+"""Width of the modes, which are beside the events, as a percentage of the total width."""
 _TITLE_KEYS = ("foxglovePanelTitle", "lichtblickPanelTitle")
-"""Settings that contain the title of a panel, one for each viewer."""
+"""Settings that contain the title of a panel, one per viewer."""
 
 JsonObject = dict[str, Any]
 Tree = str | JsonObject
-"""Identifier of a panel, or a node that divides an area into two."""
+"""Identifier of a panel, or a node that splits an area in two."""
 
 
-def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
-    """Returns a layout of plots for Foxglove, a program that shows data of robots.
+def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
+    """Writes the layout of a log or a bag for the viewers Foxglove and Lichtblick.
 
-    The layout shows the channels of a log or of a running session. Foxglove opens it from a
-    file.
+    With this layout, the viewer shows plots of all sites without any manual arrangement.
 
     Args:
-        sources: Standard channels by topic, for each source of data. If there are several
-            sources, each has a tab, whose title is the name of the source.
+        log: File of the log or bag.
+        force: True to replace an existing file.
 
     Returns:
-        The layout as plain values of JSON.
+        The path of the layout, which is next to the log.
+
+    Raises:
+        UsageError: The file contains no channels for viewers, or the layout already exists.
+        LogError: The log cannot be read.
+    """
+    path = log.with_suffix(_LAYOUT_SUFFIX)
+    refuse_existing(path, force=force)
+    channels = Ros2Topics.of_file(log)
+    if not PlotLayout.of_channels(channels).pages:
+        raise UsageError(
+            f"{log}: there is nothing to plot, because the file is not finished or was written "
+            f"with --views off; write a file for viewers with `trilat log export {log} --to "
+            "ros2`, and name that file instead"
+        )
+
+    sources = {"ROS 2": channels}
+    if channels.are_of_log:
+        sources = {"Log": channels, "ROS 2": Ros2Topics.of_log(open_log(log))}
+    layout = _build_layout(sources)
+    write_whole(path, json.dumps(layout, indent=1) + "\n", force=force)
+    return path
+
+
+def _build_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
+    """Returns a Foxglove layout that shows the channels of a log or of a running session.
+
+    Foxglove opens the layout from a file.
+
+    Args:
+        sources: For each data source, its standard channels by topic. If there are several
+            sources, each has a tab titled with the name of the source.
+
+    Returns:
+        The layout as plain JSON values.
     """
     panels = _Panels()
     trees = {name: _arrange_source(panels, channels) for name, channels in sources.items()}
@@ -76,20 +119,19 @@ def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
 
 
 class _Panels:
-    """Collects the panels of a layout for Foxglove, and gives each one an identifier.
+    """Collects the panels of a Foxglove layout and assigns an identifier to each.
 
-    Foxglove is a viewer for data of robots. Its layout file refers to panels by their
-    identifiers.
+    The layout file refers to panels through these identifiers.
 
     Attributes:
-        settings: Settings of each panel, by its identifier.
+        settings: Mapping from panel identifier to the settings of the panel.
     """
 
     def __init__(self) -> None:
         self.settings: dict[str, JsonObject] = {}
 
     def add(self, kind: str, settings: JsonObject, title: str = "") -> str:
-        """Adds a panel, such as a plot, to the layout of the viewer Foxglove.
+        """Adds a panel, such as a plot, to the Foxglove layout.
 
         Args:
             kind: Type of the panel, such as "Plot".
@@ -105,10 +147,10 @@ class _Panels:
         return identifier
 
     def add_tabs(self, trees: Mapping[str, Tree]) -> str:
-        """Adds a panel with tabs to the layout, each of which contains other panels.
+        """Adds a panel with tabs, each of which contains other panels, to the layout.
 
         Args:
-            trees: Contents of each tab, by its title.
+            trees: Mapping from the title of each tab to its contents.
 
         Returns:
             The identifier of the panel.
@@ -120,10 +162,10 @@ class _Panels:
 def _arrange_source(panels: _Panels, channels: Ros2Channels) -> Tree:
     """Arranges the data of one log or session: tabs of plots and arms, above modes and events.
 
-    A mode is what an arm's controller does at a time, for example "resting". Areas without data
-    are left out.
+    A mode, for example "resting", is what the controller of an arm is doing. Areas without data
+    are omitted.
     """
-    layout = build_plot_layout(channels)
+    layout = PlotLayout.of_channels(channels)
     tabs: dict[str, Tree] = {}
     for name, page in layout.pages.items():
         rows = []
@@ -150,21 +192,21 @@ def _arrange_source(panels: _Panels, channels: Ros2Channels) -> Tree:
 
 
 def _is_mode(plot: CurvePlot) -> bool:
-    """Returns True for the plot of a mode, because `_add_modes` shows modes."""
+    """Returns True for the plot of a mode. Modes have their own panel, see `_add_modes`."""
     names = [curves.entity.rpartition("/")[2] for curves in plot.curves]
     return all(name in _MODE_NUMBERS for name in names)
 
 
 def _divide(direction: str, trees: Sequence[Tree], first_percent: float | None = None) -> Tree:
-    """Divides an area of the viewer among several panels, or groups of panels (trees).
+    """Divides an area of the viewer among several panels or groups of panels (trees).
 
-    The viewer divides an area into two parts only. Therefore the first tree gets its share, and
-    the rest of the area is divided again.
+    The viewer can only split an area in two, so the first tree receives its share and the
+    remaining area is split again.
 
     Args:
-        direction: "row" to place the trees beside one another, "column" to stack them.
+        direction: "row" to place the trees side by side, "column" to stack them.
         trees: The trees, at least one.
-        first_percent: Share of the first tree, in %. `None` if all trees have the same size.
+        first_percent: Share of the first tree, in %. `None` to give all trees the same size.
     """
     first, *others = trees
     if not others:
@@ -180,7 +222,7 @@ def _divide(direction: str, trees: Sequence[Tree], first_percent: float | None =
 def _add_plot(panels: _Panels, channels: Ros2Channels, plot: CurvePlot) -> str:
     """Adds a plot with the curves of a quantity, such as joint angles. Returns its identifier.
 
-    Curves that are hidden by default are left out. References, which an arm should follow, are
+    Curves that are hidden by default are omitted. References, which an arm should follow, are
     dashed.
     """
     curve_settings = []
@@ -216,10 +258,10 @@ def _add_plot(panels: _Panels, channels: Ros2Channels, plot: CurvePlot) -> str:
 
 
 def _get_list_path(channels: Ros2Channels, entity: str) -> str:
-    """Returns the path in a Foxglove message of the list of numbers that a plot shows.
+    """Returns the path of a list of numbers, to be plotted, within a Foxglove message.
 
     Args:
-        channels: Standard channels by topic.
+        channels: Mapping from topic to standard channel.
         entity: Topic of an array, or the topic of joint states followed by the name of one of
             their lists, as in `rerun_viewer._PlotCurves`.
     """
@@ -236,7 +278,7 @@ def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
 
     Args:
         panels: Panels of the layout, to which the panel is added.
-        channels: Standard channels by topic.
+        channels: Mapping from topic to standard channel.
 
     Returns:
         The identifier of the panel. Empty if there are no modes.
@@ -266,7 +308,7 @@ def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
 
 
 def _name_mode_numbers() -> JsonObject:
-    """Returns the setting that makes a viewer show the name of a mode instead of its number."""
+    """Returns the setting that makes a viewer show mode names instead of mode numbers."""
     states = []
     for word, number in NUMBERS_BY_MODE_WORD.items():
         states.append({"value": number, "operator": "=", "label": word})
@@ -274,7 +316,7 @@ def _name_mode_numbers() -> JsonObject:
 
 
 def _add_events(panels: _Panels, layout: PlotLayout) -> str:
-    """Adds a panel with the events as lines of text. Returns "" if there are no events."""
+    """Adds a panel that lists the events as text. Returns "" if there are no events."""
     if not layout.lines:
         return ""
     # Viewers call the type of this panel "RosOut" in files.

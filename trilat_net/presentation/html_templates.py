@@ -1,13 +1,13 @@
 """Renders web pages from the Jinja templates in the folder `templates`.
 
 `report.html` is the page that reports a run. The other templates contain macros, each for a
-piece of HTML, such as a table. A module `page_...` computes the values of its section of the
-report, and the templates contain all of the HTML.
+piece of HTML such as a table. The `page_...` modules compute the values for their sections of
+the report; all HTML is in the templates.
 
 Invariant:
-    - Templates escape every value that is a plain string. Only values of the class `Markup` are
-      inserted as HTML. These are the results of other templates, and files of this package.
-    - If a template refers to a value that is not passed to it, an error is raised.
+    - Templates escape every plain string. Only `Markup` values, which are the results of other
+      templates or files of this package, are inserted as HTML.
+    - Referring to a value that was not passed to the template raises an error.
     - This module imports Jinja, and is itself imported only when HTML is rendered.
 """
 
@@ -22,23 +22,23 @@ from markupsafe import Markup, escape
 from .untrusted_text import HASH
 
 _CODE = re.compile(r"`([^`]+)`")
-"""Text in backticks, which the page shows as code."""
+"""Matches text in backticks, which the page shows as code."""
 
 
 def render_template(name: str, /, **values: Any) -> Markup:
-    """Renders a whole Jinja template, such as the web page of a report.
+    """Renders a complete Jinja template, such as the web page of a report.
 
-    Values that are plain strings are escaped, so that they cannot insert HTML.
+    Plain strings are escaped, so that they cannot inject HTML.
 
     Args:
         name: File name of the template.
-        **values: Values that the template names.
+        **values: Values of the template's variables.
     """
     return Markup(_make_environment().get_template(name).render(values))
 
 
 def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
-    """Renders a macro of a Jinja template, a part with parameters such as a table.
+    """Renders a single macro of a Jinja template, for example a table.
 
     Args:
         template: File name of the template.
@@ -51,7 +51,7 @@ def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
 
 @cache
 def _make_environment() -> Environment:
-    """Returns the Jinja environment of the report: settings and functions of all templates.
+    """Returns the Jinja environment of the report: settings and functions for all templates.
 
     The result is cached, so that each template is compiled only once.
     """
@@ -73,7 +73,7 @@ def _make_environment() -> Environment:
 
 
 def _mark_hashes(text: str) -> Markup:
-    """Converts plain text to HTML, and keeps each hash on a single line for copying.
+    """Converts plain text to HTML, keeping each hash on a single line for copying.
 
     A hash is a long hexadecimal number that identifies a file.
 
@@ -85,5 +85,5 @@ def _mark_hashes(text: str) -> Markup:
 
 
 def _mark_code(text: str) -> Markup:
-    """Converts plain text to HTML, with text in backticks as code."""
+    """Converts plain text to HTML, showing text in backticks as code."""
     return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))

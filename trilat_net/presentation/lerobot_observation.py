@@ -1,13 +1,13 @@
-"""Computes from a log the observation that the LeRobot plugin provides in a live session.
+"""Computes from a log the observations that the LeRobot plugin provides in a live session.
 
 The plugin `lerobot_robot_trilat` moves the arm of one user. It observes the slave, the arm of
-the user, and the operator model that moves this arm. A program that was trained with the
-observations of this module can therefore act through the plugin.
+the user, and the operator model that moves this arm. A program trained with the observations
+computed here can therefore act through the plugin.
 
 Invariant:
-    - The names and their order are those of `observation_features` of the plugin. A test
-      compares the two.
-    - An angle is in rad, a velocity in rad/s, a torque in N m, a position in m, a force in N.
+    - The names and their order match `observation_features` of the plugin. A test compares the
+      two.
+    - Angles are in rad, velocities in rad/s, torques in N m, positions in m, and forces in N.
 """
 
 from collections.abc import Mapping
@@ -21,18 +21,18 @@ from ..log import Ints, Log
 from ..scenario import TASK_AXES, LiveHand
 
 _HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
-"""Kind of exported actions that an operator accepts as commands, by mode of the operator."""
+"""Kind of exported actions that an operator accepts as commands, keyed by operator mode."""
 
 
 def _find_plugin_hand(log: Log, site: str) -> LiveHand:
-    """Finds the operator of an arm through which the program of a plugin moves the arm.
+    """Finds the operator model through which a plugin's program moves an arm.
 
     Args:
         log: Log of the run.
-        site: Name of the site, the process that controls the arm.
+        site: Name of the site.
 
     Raises:
-        UsageError: No program can move the arm of this site in the scenario.
+        UsageError: The scenario does not allow a program to move the arm of this site.
     """
     hand = log.scenario.sites[site].find_live_hand()
     if hand is None:
@@ -45,10 +45,11 @@ def _find_plugin_hand(log: Log, site: str) -> LiveHand:
 
 
 def find_plugin_actions(log: Log, site: str) -> str:
-    """Returns the kind of actions with which a log must be exported for the LeRobot plugin.
+    """Returns the kind of actions to use when exporting a log for the LeRobot plugin.
 
-    The plugin commands the operator model of an arm by positions of its end effector ("tip") or
-    by joint angles. A dataset for training must contain the same kind.
+    The plugin commands the operator model of an arm through positions of its end effector
+    ("tip") or through joint angles. A dataset for training must contain the same kind of
+    action.
 
     Args:
         log: Log of the run.
@@ -69,18 +70,18 @@ def find_plugin_actions(log: Log, site: str) -> str:
 def observe_as_plugin(
     log: Log, slave: str, site: str, rows: Mapping[str, Ints]
 ) -> tuple[Array, list[str]]:
-    """Returns the observation of the LeRobot plugin in every frame of a log.
+    """Returns the observations that the LeRobot plugin would make in every frame of a log.
 
-    A policy can then be trained from logs, and later run by the plugin.
+    This allows training a policy from logs and later running it through the plugin.
 
     Args:
         log: Log of the run.
         slave: Name of the slave.
         site: Name of the site whose arm the plugin holds.
-        rows: For each site, the index of each frame's record, shape (F,).
+        rows: For each site, the record index of each frame, shape (F,).
 
     Returns:
-        The observation, shape (F, n), and the names of its n components.
+        The observations, shape (F, n), and the names of the n components.
 
     Raises:
         UsageError: The scenario has no operator for the plugin at this site.
@@ -125,8 +126,8 @@ def observe_as_plugin(
 def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array) -> Array:
     """Computes the force of an operator model on its arm, as `Hand.force` does in a session.
 
-    The operator is modelled as a spring and damper that pulls the arm to a target. With the
-    stiffness K and the damping B, the force is
+    The operator is modelled as a spring and damper that pulls the arm towards a target. With
+    stiffness K and damping B, the force is
 
         F = K (target - pose) + B (target rate - pose rate)
 
@@ -136,7 +137,7 @@ def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array)
         hand: The operator.
         vectors: Field `hand` of the records (`HandInForce`), shape (F, 3 + 2 n).
         pose: Pose of the arm in the coordinates of the operator, shape (F, n).
-        pose_rate: Its time derivative, shape (F, n).
+        pose_rate: Time derivative of the pose, shape (F, n).
 
     Returns:
         The force in N, or in mode `joint` the torques in N m, shape (F, n).

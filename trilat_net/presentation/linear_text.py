@@ -1,13 +1,13 @@
-"""Composes the text that `trilat linear` prints: whether small motions of coupled arms decay.
+"""Composes the output of `trilat linear`: whether small motions of the coupled arms decay.
 
-The text contains the pose of rest at which the arms are linearised, the delays, a table of the
+The text contains the rest pose at which the arms are linearised, the delays, a table of the
 rightmost characteristic roots, the verdict, the largest stable delay, what operators feel, and
-the values of settings, such as gains, at which stability changes.
+the values at which settings such as gains change the stability.
 
 Invariant:
     - Every number has its unit.
-    - Roots that are zero by the structure of the system, whatever its parameters are, are
-      counted and not listed, because they say nothing about stability.
+    - Roots that are structurally zero, whatever the parameters, are counted but not listed,
+      because they are irrelevant to stability.
 """
 
 import math
@@ -16,7 +16,7 @@ from itertools import chain
 
 import numpy as np
 
-from ..analysis import QUOTED_AT_HZ, LinearAnalysis, Passivity, PortAnalysis, TwoPort
+from ..analysis import QUOTED_AT_HZ, LinearAnalysis, Passivity, PortAnalysis
 from ..core import Array
 from ..errors import count_nouns
 from .decision_text import describe_tick_span
@@ -29,20 +29,20 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
     """Yields the text that says whether small motions of the coupled arms decay.
 
     The arms, their controllers and the network delays form a loop, which the analysis has
-    linearised at a pose of rest (equilibrium). The text contains, in order, the equilibrium,
-    the delays, the characteristic roots, the verdict about stability, the delay margin, notes,
-    what operators feel at the arms, and scans of settings.
+    linearised at a rest pose (equilibrium). The text contains, in order, the equilibrium, the
+    delays, the characteristic roots, the stability verdict, the delay margin, notes, what
+    operators feel at the arms, and scans of settings.
 
     Args:
-        analysis: The analysis.
+        analysis: The linear analysis.
     """
-    yield from describe_equilibrium(analysis)
-    yield from describe_effective_delays(analysis)
+    yield from _describe_equilibrium(analysis)
+    yield from _describe_effective_delays(analysis)
     yield ""
-    yield tabulate_roots(analysis)
-    yield describe_zero_roots(analysis)
+    yield _tabulate_roots(analysis)
+    yield _describe_zero_roots(analysis)
 
-    verdict, _, explanation = describe_linear_verdict(analysis).partition(": ")
+    verdict, _, explanation = _describe_linear_verdict(analysis).partition(": ")
     yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", explanation)
 
     margin = analysis.margin.description
@@ -59,7 +59,7 @@ def _describe_scans(analysis: LinearAnalysis) -> Iterator[str]:
     An example is "control.Kd from 0 to 10: stable from 1.2 on (3.4 rad/s)".
 
     Args:
-        analysis: The analysis, with a scan of the values of each setting.
+        analysis: The analysis, with one scan per setting.
     """
     for scan in analysis.scans:
         edge_texts = []
@@ -73,11 +73,11 @@ def _describe_scans(analysis: LinearAnalysis) -> Iterator[str]:
         yield f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
 
 
-def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
+def _describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines that describe the equilibrium pose at which the arms were linearised.
 
     The lines state how the equilibrium was computed, its residual, and the pose of each arm. If
-    all arms have the same joint angles, a single line states these angles.
+    all arms have the same joint angles, these are given on a single line.
 
     Args:
         analysis: The analysis.
@@ -104,15 +104,15 @@ def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
 
 
 def _list_numbers(values: Array) -> str:
-    """Returns numbers with four decimals, separated by commas."""
+    """Formats numbers with four decimals, separated by commas."""
     return ", ".join(f"{value:.4f}" for value in values)
 
 
-def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
+def _describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields lines for the user about the delays with which arms follow each other.
 
-    There is a line for each link (one-way connection between two arms), or a single line if all
-    delays are equal. If a delay varies during a run, its mean is stated.
+    There is one line per link, or a single line if all delays are equal. For a delay that
+    varies during a run, the mean is given.
 
     Args:
         analysis: Result of the linear stability analysis.
@@ -132,24 +132,24 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
         yield f"{quantity} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
 
 
-def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
+def _tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     """Returns a table of the rightmost characteristic roots, which determine stability.
 
-    A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
-    The table describes the motion of each root.
+    A motion with root s evolves as exp(s t), and grows if the real part of s is positive. The
+    table describes the motion of each root.
 
-    The roots are those of the continuous loop, whose controllers act in continuous time. If a
-    root of the sampled loop, whose controllers compute once per tick, differs, two further
+    The roots are those of the continuous loop, whose controllers act in continuous time. If any
+    root of the sampled loop, whose controllers compute once per tick, is different, two more
     columns contain the roots of the sampled loop. If the delays differ from tick to tick, the
-    table has only the roots of the sampled loop over a span of ticks, because the continuous
-    loop has only mean delays.
+    table contains only the roots of the sampled loop over a span of ticks, because the
+    continuous loop uses mean delays.
 
     Args:
         analysis: The analysis.
 
     Returns:
-        The table with a row per root: real part in 1/s, imaginary part in rad/s, frequency in
-        Hz, damping ratio, number of equal roots ("modes"), and the states that move most.
+        The table with one row per root: real part in 1/s, imaginary part in rad/s, frequency in
+            Hz, damping ratio, number of equal roots ("modes"), and the states that move most.
     """
     ticks_differ = analysis.decisive.span_s is not None
     roots = analysis.decisive.roots if ticks_differ else analysis.continuous.roots
@@ -184,13 +184,13 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 
 def describe_moving_states(states: Sequence[str]) -> str:
-    """Returns the states of a loop that move together, grouped by site.
+    """Returns a phrase with the states of a loop that move together, grouped by state.
 
-    Sites with the same state share a phrase: "q2 of m1, m2, s" stands for the second joint
+    Sites that share a state are listed together: "q2 of m1, m2, s" stands for the second joint
     angle of three sites.
 
     Args:
-        states: Names of the states, each after the name of its site, such as "m1.q2".
+        states: Names of the states, each prefixed with the name of its site, such as "m1.q2".
     """
     sites: dict[str, list[str]] = {}
     for state in states:
@@ -200,11 +200,11 @@ def describe_moving_states(states: Sequence[str]) -> str:
     return "; ".join(phrases)
 
 
-def describe_zero_roots(analysis: LinearAnalysis) -> str:
-    """Returns a sentence about the roots that are zero by the structure of the system.
+def _describe_zero_roots(analysis: LinearAnalysis) -> str:
+    """Returns a sentence about the roots that are structurally zero.
 
     For example, if all arms were moved to another common pose, no torque would bring them back.
-    Such roots are irrelevant for the stability of the loop.
+    Such roots are irrelevant to the stability of the loop.
 
     Args:
         analysis: The analysis.
@@ -223,22 +223,22 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
     )
 
 
-def describe_linear_verdict(analysis: LinearAnalysis) -> str:
+def _describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns a sentence that says whether small motions of the coupled arms decay.
 
     The sentence states the growth rate and the frequency of the slowest decaying, or fastest
-    growing, motion. Rate and frequency follow from the characteristic root with the largest
-    real part. Motions that neither decay nor grow, but keep a constant speed ("drifting"), are
-    only counted. An example is "stable: the slowest motion goes as exp(-1.2 t / s) at 3.4
-    rad/s, as computed tick by tick".
+    growing, motion, which are given by the characteristic root with the largest real part.
+    Motions that neither decay nor grow but keep a constant speed ("drifting") are only counted.
+    An example is "stable: the slowest motion goes as exp(-1.2 t / s) at 3.4 rad/s, as computed
+    tick by tick".
 
     Args:
-        analysis: Result of the linear stability analysis. The roots that determine stability
-            (`decisive`) are those of the sampled loop, whose controllers compute in ticks, if
-            it could be analysed, and otherwise those of the continuous loop.
+        analysis: Result of the linear stability analysis. Stability is determined by the roots
+            in `decisive`: those of the sampled loop if it could be analysed, otherwise those of
+            the continuous loop.
 
     Returns:
-        The sentence, which begins with the verdict "stable", "unstable" or "at the edge".
+        The sentence, which starts with the verdict "stable", "unstable" or "at the edge".
     """
     rightmost = analysis.decisive.rightmost
     drifting_count = analysis.decisive.drifting
@@ -266,25 +266,25 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
 
 
 _MAX_BANDS = 3
-"""Largest number of listed frequency bands."""
+"""Maximum number of frequency bands to list."""
 _MAX_SEPARATE_JOINTS = 2
-"""Largest number of joints for which every failing two-port has a separate line."""
+"""Maximum number of joints for which each failing two-port is printed on its own line."""
 WEIGHTS_ALIKE = 1e-9
-"""Largest difference between weights that count as equal."""
+"""Maximum difference between weights that are considered equal."""
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
-    """Returns lines for the user about what operators feel and whether arms stay stable.
+    """Returns lines that tell the user what operators feel and whether the arms stay stable.
 
-    The lines are about three properties:
+    The lines cover three properties:
 
     - passivity: the arms never supply energy to the operators,
     - absolute stability: the arms are stable with any passive operators,
     - transparency: the impedance that an operator feels while another arm is free or clamped.
 
-    If the arms are unstable without operators, the other properties are not defined and the
-    lines end there. If they are unstable while one of them is clamped, the lines about
-    transparency are left out.
+    If the arms are unstable even without operators, the other properties are undefined and the
+    text ends there. If they are unstable while one of them is clamped, the lines about
+    transparency are omitted.
 
     Args:
         ports: Results for the joints at which the operators act.
@@ -319,7 +319,7 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
 
 
 def _describe_conditions(ports: PortAnalysis) -> list[str]:
-    """Returns the lines about the analysed ports and the grid of frequencies."""
+    """Returns lines about the analysed ports and the frequency grid."""
     low_hz, high_hz = ports.band_hz
     conditions = f"operators and environments off, {low_hz:g}-{high_hz:g} Hz"
     grid = "(a grid refined at minima: evidence, no proof)"
@@ -331,14 +331,15 @@ def _describe_conditions(ports: PortAnalysis) -> list[str]:
 
 
 def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
-    """Returns the lines about the passivity of all ports, of each joint, and of the proof.
+    """Returns lines about the passivity of all ports together, of each joint, and in the proof.
 
     A port is a joint or axis at which an operator holds an arm. The arms are passive if they
-    never supply energy to the operators. The stability proof assumes operators that are passive
-    in r, the velocity plus Lambda times the error e, instead of the velocity.
+    never supply energy to the operators. The stability proof requires operators that are
+    passive with respect to r, the velocity plus Lambda times the error e, instead of the
+    velocity.
 
-    At zero frequency, the admittance Y (velocities per torque) may have a pole: a constant
-    torque makes a velocity grow. For free masses, this is compatible with passivity.
+    At zero frequency, the admittance Y (velocity per torque) may have a pole, because a
+    constant torque makes a velocity grow. For free masses, this is compatible with passivity.
 
     Args:
         ports: Results for the ports.
@@ -369,11 +370,12 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
     """Returns a sentence about the condition on operators that the stability proof assumes.
 
     The proof assumes that operators are passive with respect to r, the velocity plus Lambda
-    times the error e. Passive operators give back no more energy than they took.
+    times the error e. A passive operator never returns more energy than it has received.
 
     Args:
         ports: Results for the joints or axes at which operators act.
-        proof: Passivity in r, with the joints of each site weighted as in the proof.
+        proof: Passivity with respect to r, with the joints of each site weighted as in the
+            proof.
     """
     beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
     text = f"{_describe_passivity(proof)}; sites weighted {beta}"
@@ -388,7 +390,7 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
 
 
 def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") -> str:
-    """Returns a sentence that says whether the arms are passive, and which damping is missing.
+    """Returns a sentence on whether the arms are passive, and how much damping is missing.
 
     Passive arms never supply energy to an operator. An example of a negative result is "not
     passive at 2-5 Hz; least eigenvalue -0.1 at 3 Hz; adding 0.05 N m s/rad at each joint would
@@ -396,8 +398,8 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
 
     Args:
         passivity: Result for one joint or for all joints at which operators act.
-        unit: Unit of the missing damping. Empty to leave out the damping.
-        kind: "joint" or "axis", at which operators act.
+        unit: Unit of the missing damping. Empty to omit the damping.
+        kind: "joint" or "axis", depending on where operators act.
     """
     if passivity.passive:
         return "passive"
@@ -417,7 +419,7 @@ def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") ->
 
 
 def _list_bands(bands: Sequence[tuple[float, float]]) -> str:
-    """Returns frequency bands as text, at most `_MAX_BANDS` of them."""
+    """Formats frequency bands as text, at most `_MAX_BANDS` of them."""
     ranges = [f"{from_hz:.3g}-{to_hz:.3g}" for from_hz, to_hz in bands[:_MAX_BANDS]]
     text = f"at {', '.join(ranges)} Hz"
     if len(bands) > _MAX_BANDS:
@@ -426,7 +428,10 @@ def _list_bands(bands: Sequence[tuple[float, float]]) -> str:
 
 
 def _describe_absolute_stability(ports: PortAnalysis) -> str:
-    """Returns whether passive operators can make the loop unstable, with the margin."""
+    """Returns a sentence on whether passive operators can make the loop unstable.
+
+    The sentence includes the margin.
+    """
     minima = ports.absolute
     if not minima.below:
         return "stable"
@@ -436,83 +441,60 @@ def _describe_absolute_stability(ports: PortAnalysis) -> str:
 
 
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
-    """Returns the lines about Llewellyn's criterion, which decides on stability for two sites.
+    """Returns lines about Llewellyn's criterion, which determines stability for two sites.
 
-    A two-port is one joint of two sites, with one operator at each site. A third site is free,
-    or its arm is clamped. The criterion fails if Llewellyn's parameter is below 1 in some band
-    of frequencies. Then some passive operators make the two-port unstable. A line describes a
-    failing two-port, or a group of them, and a last line states the number of two-ports for
-    which the criterion holds.
+    A two-port is one joint of two sites, with an operator at each site. The arm of a third site
+    is free or clamped. The criterion fails if Llewellyn's parameter is below 1 in some
+    frequency band, in which case some passive operators make the two-port unstable. There is
+    one line per failing two-port, or group of them, and a last line gives the number of
+    two-ports that satisfy the criterion.
 
     Args:
         ports: Results for the joints at which the operators act.
     """
-    failing_ports = [two_port for two_port in ports.two_ports if two_port.minima.below]
-
     # For arms with many joints, the failing two-ports of a pair of sites share a line.
     has_line_per_joint = len(ports.joints) <= _MAX_SEPARATE_JOINTS
-    ports_by_line: dict[tuple[object, ...], list[TwoPort]] = {}
-    for two_port in failing_ports:
-        joint = two_port.joint if has_line_per_joint else ""
-        line_key = (two_port.sites, two_port.clamped, joint)
-        ports_by_line.setdefault(line_key, []).append(two_port)
-    lines = [_describe_failing(ports, group) for group in ports_by_line.values()]
+    lines = []
+    failing_count = 0
+    for group in ports.group_failing_two_ports(by_joint=has_line_per_joint):
+        failing_count += len(group)
+        worst = min(group, key=lambda two_port: two_port.minima.least)
 
-    holding_count = len(ports.two_ports) - len(failing_ports)
+        # In task space, the numbers of the ports stand for axes with names.
+        port_names = [str(ports.axes.get(port.joint, port.joint)) for port in group]
+        subject = " and ".join(worst.sites)
+        if worst.clamped:
+            subject += f", {worst.clamped} clamped"
+        subject += f", {ports.kind} {', '.join(port_names)}"
+
+        frequencies = _list_bands(worst.minima.below)
+        if len(group) > 1:
+            # Several two-ports have too many bands to list, but one range contains them.
+            bands = list(chain.from_iterable(port.minima.below for port in group))
+            from_hz = min(band.from_hz for band in bands)
+            to_hz = max(band.to_hz for band in bands)
+            frequencies = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
+        least = f"least {worst.minima.least:.3g} at {worst.minima.least_hz:.3g} Hz"
+        lines.append(f"{subject}: fails {frequencies}; {least}")
+
+    holding_count = len(ports.two_ports) - failing_count
     if not holding_count:
         return lines
 
     subject = "the others"
-    if not failing_ports:
+    if not failing_count:
         subject = f"every pair and {ports.kind}"
         if any(two_port.clamped for two_port in ports.two_ports):
             subject += ", the third site free or clamped"
     return [*lines, f"{subject}: holds ({holding_count} two-ports)"]
 
 
-def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
-    """Returns a line that says at which frequencies Llewellyn's criterion fails.
-
-    A two-port is one joint of two sites. The criterion fails at a frequency if Llewellyn's
-    parameter is below 1 there. The line ends with the smallest value of the parameter and its
-    frequency. An example is "m1 and s, joint 1: fails at 2-5 Hz; least 0.8 at 3 Hz".
-
-    Args:
-        ports: Results for all joints, from which the names of joints and axes are taken.
-        group: Failing two-ports of the same two sites. All have the same third site clamped, or
-            no clamped site.
-    """
-    worst = min(group, key=lambda two_port: two_port.minima.least)
-    minima = worst.minima
-
-    # In task space, the numbers of the ports stand for axes with names.
-    port_names = []
-    for two_port in group:
-        port_name = ports.axes.get(two_port.joint, two_port.joint)
-        port_names.append(str(port_name))
-    subject = " and ".join(worst.sites)
-    if worst.clamped:
-        subject += f", {worst.clamped} clamped"
-    subject += f", {ports.kind} {', '.join(port_names)}"
-
-    if len(group) == 1:
-        frequencies = _list_bands(minima.below)
-    else:
-        # Several two-ports have too many bands to list. The range that contains them is stated.
-        bands = list(chain.from_iterable(two_port.minima.below for two_port in group))
-        from_hz = min(band.from_hz for band in bands)
-        to_hz = max(band.to_hz for band in bands)
-        frequencies = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
-    least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
-    return f"{subject}: fails {frequencies}; {least}"
-
-
 def _describe_transparency(ports: PortAnalysis) -> Iterator[str]:
-    """Yields a sentence about the impedance that an operator feels along each joint.
+    """Yields a sentence about the impedance that an operator feels at each joint.
 
-    The impedance (force over velocity) is stated while the other arm can move freely, and while
-    the other arm is clamped. The larger the ratio of the two, the better the operator can feel
-    what the other arm touches.
+    The impedance (force over velocity) is given both for a free and for a clamped other arm.
+    The larger the ratio of the two, the better the operator can feel what the other arm
+    touches.
     """
     for transparency in ports.transparency:
         unit = ports.impedance_unit(transparency.joint)

@@ -1,4 +1,4 @@
-"""Writes the sentences for users on the energies that control laws declare.
+"""Describes the energies declared by control laws in sentences for users.
 
 `analysis.certificate.observed_energy` compares these energies with the records, and returns
 names and numbers.
@@ -16,7 +16,7 @@ NEGATIVE_ENERGY_MEANING = (
     "reserve included. Passivity then proves nothing about the run, which may be stable "
     "nevertheless"
 )
-"""Explanation of a negative energy, in the same words wherever users read it."""
+"""Explanation of a negative energy, worded identically wherever users read it."""
 _FINDINGS = {
     ObservedFinding.PASSIVE: "observed energy never below zero",
     ObservedFinding.NEGATIVE: "observed energy below zero",
@@ -26,7 +26,7 @@ _FINDINGS = {
 
 
 def _describe_observed(observed: ObservedEnergy) -> str:
-    """Returns a sentence on whether the declared energies are true and stay above zero."""
+    """Returns a sentence on whether the declared energies are correct and remain above zero."""
     return f"{_FINDINGS[observed.finding]}: {_describe_cause(observed)}"
 
 
@@ -52,7 +52,7 @@ def _describe_cause(observed: ObservedEnergy) -> str:
 
 
 def _explain_finding(finding: ObservedFinding) -> str:
-    """Returns the meaning of a finding for a run. Empty if it needs no explanation."""
+    """Returns what a finding means for a run. Empty if it needs no explanation."""
     return NEGATIVE_ENERGY_MEANING if finding is ObservedFinding.NEGATIVE else ""
 
 
@@ -60,4 +60,4 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
     ObservedEnergy: _describe_observed,
     ObservedFinding: _explain_finding,
 }
-"""The functions that describe the findings of this module, by the class of the finding."""
+"""Functions that describe findings, keyed by the class of the finding."""

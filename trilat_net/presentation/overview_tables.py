@@ -1,15 +1,15 @@
-"""Composes the text of `trilat log info`, which describes the contents of log files.
+"""Composes the output of `trilat log info`, which describes the contents of log files.
 
 The text has these parts:
 
-- The session, its arms, and the network connections between them, if trilat-net wrote the log.
-- The channels, which are the series of messages in the files.
+- The session, its arms and its links, if trilat-net wrote the log.
+- The channels (series of messages) in the files.
 - The number of messages, as counted by the process that wrote the log.
-- A line for each file.
+- One line per file.
 
 Invariant:
-    - Texts from a file are passed through `sanitize`, or are cells of a table, which
-      `result_text` sanitizes. A file therefore cannot control the terminal.
+    - Strings from a file are passed through `sanitize`, or are table cells, which `result_text`
+      sanitizes. A file therefore cannot control the terminal.
 """
 
 import re
@@ -23,11 +23,11 @@ from .result_text import Block, MarkedText, TextTable
 from .untrusted_text import sanitize
 
 _MAX_GAPS = 4
-"""Largest number of listed gaps of a channel, and of damaged parts of a file."""
+"""Maximum number of gaps listed per channel, and of damaged parts listed per file."""
 _VIEW_PREFIX = "/viz/"
-"""First part of the names of standard channels for other tools."""
+"""Prefix of the names of standard channels for other tools."""
 _FAULTY_ACCOUNT = re.compile(r"(missing|duplicate|reordered|refilled|overflowed) [1-9]")
-"""Pattern of a fault in the recorder's counts, such as "missing 3"."""
+"""Matches a fault in the recorder's counts, such as "missing 3"."""
 _SIZE_UNITS = {"GB": 10**9, "MB": 10**6, "kB": 10**3}
 
 
@@ -35,7 +35,7 @@ def compose_overview(overview: FileOverview) -> Iterator[Block]:
     """Yields the text that describes the contents of log files.
 
     The text contains the session, the tables, the number of messages, the origin and the files.
-    If the files are not a log of trilat-net, only the channels and the files are described.
+    If trilat-net did not write the files, only the channels and the files are described.
 
     Args:
         overview: Contents of the files.
@@ -70,8 +70,7 @@ def compose_overview(overview: FileOverview) -> Iterator[Block]:
 def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
     """Yields lines about a recorded session: its name, scenario, duration and records.
 
-    A scenario is the text that defines the run. Its hash shows whether the log contains the
-    text that was executed.
+    The hash of the scenario shows whether the log contains the text that was executed.
     """
     scenario: JsonObject = session["scenario"]
     name = f"{session['session']}, {session['driver']}"
@@ -93,7 +92,7 @@ def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
 
 
 def _describe_records(facts: JsonObject, session: JsonObject) -> str:
-    """Returns the counts of recorded and missing records, and whether the files are intact.
+    """Returns the numbers of recorded and missing records, and whether the files are intact.
 
     For example: "30000, none missing; finished".
     """
@@ -115,7 +114,7 @@ def _describe_records(facts: JsonObject, session: JsonObject) -> str:
 
 
 def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
-    """Yields a table of the records of each arm, and a table of the timing of its control loop.
+    """Yields a table of each arm's records, and a table of its control loop timing.
 
     The second table exists only for sessions in real time.
     """
@@ -149,11 +148,11 @@ def _compose_sites(sites: Mapping[str, JsonObject]) -> Iterator[Block]:
 
 
 def _compose_links(links: Mapping[str, JsonObject]) -> Iterator[Block]:
-    """Yields a table of the network connections (links) between the arms.
+    """Yields a table of the links between the arms.
 
-    The table contains the ages of the used messages. Further columns contain one-way delays and
-    clock differences if they were measured, and the numbers of late, lost and duplicate
-    messages.
+    The table contains the ages of the samples used. Further columns contain one-way delays and
+    clock differences, if they were measured, and the numbers of late, lost and duplicate
+    samples.
     """
     has_delays = any(link["one_way_ms"] for link in links.values())
     has_clocks = any(link["clock_bound_us"] for link in links.values())
@@ -181,11 +180,12 @@ def _compose_channels(
 ) -> Iterator[Block]:
     """Yields a table of the channels (series of messages) in the files, and the gaps in each.
 
-    A gap is a range of message numbers that the files lack, because the messages were lost.
+    A gap is a range of message numbers that are not in the files because the messages were
+    lost.
 
     Args:
-        channels: Channels by topic.
-        session: The session, whose name is left out of the topics. `None` if the files contain
+        channels: Mapping from topic to channel.
+        session: The session, whose name is omitted from the topics. `None` if the files contain
             no session.
     """
     if not channels:
@@ -237,7 +237,7 @@ def _list_gaps(gaps: Sequence[tuple[int, int]]) -> str:
 
 
 def _compose_views(views: Mapping[str, JsonObject]) -> Iterator[Block]:
-    """Yields a table of the channels with standard messages, which other tools read."""
+    """Yields a table of the channels with standard messages, intended for other tools."""
     if not views:
         return
     rows = []
@@ -249,10 +249,10 @@ def _compose_views(views: Mapping[str, JsonObject]) -> Iterator[Block]:
 
 
 def _compose_accounts(session: JsonObject) -> Iterator[Block]:
-    """Yields the recorder's counts of the messages of each channel.
+    """Yields the recorder's message counts for each channel.
 
     The counts show whether the log is complete. Only channels with a fault, such as missing
-    messages, are listed. For the others, only their number is stated.
+    messages, are listed, followed by the number of remaining channels.
     """
     accounts: dict[str, str] = session["accounts"]
     prefix = f"/trilat/{session['session']}/"
@@ -276,9 +276,10 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
-    """Yields the versions of the software and the machine that recorded a log.
+    """Yields the software versions and the machine that recorded a log.
 
-    A run can be repeated bit for bit only with the same versions and the same arithmetic.
+    A run can be repeated bit for bit only with the same versions and the same floating-point
+    arithmetic.
     """
     versions: dict[str, str] = dict(session["versions"])
     version = versions.pop("trilat-net", "unknown")
@@ -297,7 +298,7 @@ def _compose_origin(session: JsonObject) -> Iterator[Block]:
 
 
 def _compose_file(file: JsonObject) -> Iterator[Block]:
-    """Yields a line about a log file: its size and state, and a line per damaged part."""
+    """Yields a line with the size and state of a log file, and a line per damaged part."""
     name = file["path"]
     if file["part"]:
         name += f", part {file['part'].get('index', '?')}"
@@ -322,7 +323,7 @@ def _compose_file(file: JsonObject) -> Iterator[Block]:
 
 
 def _compose_line(heading: str, text: str) -> Iterator[Block]:
-    """Yields a text after a bold heading. Yields nothing for an empty text."""
+    """Yields a text after a bold heading, or nothing for an empty text."""
     if text:
         yield MarkedText(f"[bold]{heading:<9}[/bold]", sanitize(text))
 
@@ -330,12 +331,12 @@ def _compose_line(heading: str, text: str) -> Iterator[Block]:
 def _tabulate(
     headers: Sequence[str], rows: Iterable[Sequence[object]], text_columns: int = 1
 ) -> Iterator[Block]:
-    """Yields an empty line and then a table for the terminal.
+    """Yields an empty line followed by a table for the terminal.
 
     Args:
         headers: Header of each column.
         rows: Values of each row. `None` is printed as a dash.
-        text_columns: Number of columns at the left that contain texts. The others contain
+        text_columns: Number of columns on the left that contain text. The others contain
             numbers.
     """
     text_rows = []
@@ -347,26 +348,26 @@ def _tabulate(
 
 
 def _format_counts(channel: JsonObject) -> list[object]:
-    """Returns number, rate and size of the messages of a channel, as three cells."""
+    """Returns the number, rate and size of a channel's messages as three cells."""
     rate_hz = channel["rate_hz"]
     rate = None if rate_hz is None else _format_number(rate_hz)
     return [channel["messages"], rate, _format_size(channel["bytes"])]
 
 
 def _format_percentiles(percentiles: JsonObject | None) -> list[str | None]:
-    """Returns median, 99th percentile and maximum as three cells, `None` if unknown."""
+    """Returns the median, 99th percentile and maximum as three cells, `None` if unknown."""
     if percentiles is None:
         return [None, None, None]
     return [_format_number(percentiles[key]) for key in ("p50", "p99", "max")]
 
 
 def _format_number(value: float) -> str:
-    """Returns a number with four digits, or as an integer if it is 1000 or larger."""
+    """Formats a number with four digits, or as an integer if it is 1000 or larger."""
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"
 
 
 def _format_size(size_bytes: int) -> str:
-    """Returns a size with three digits, in the largest unit that fits."""
+    """Formats a size with three digits, in the largest suitable unit."""
     for unit, unit_bytes in _SIZE_UNITS.items():
         if size_bytes >= unit_bytes:
             return f"{size_bytes / unit_bytes:.3g} {unit}"

@@ -1,10 +1,10 @@
 """Renders the section of a report that explains whether the run was stable.
 
-The section contains the sentences of `trilat certify`, and figures of V, the energy function of
+The section contains the sentences of `trilat certify`, and figures of V, the energy function in
 the stability proof.
 
 Invariant:
-    - The sentences are those that `trilat certify` prints, with longer names of the checks.
+    - The sentences are those printed by `trilat certify`, but with longer names for the checks.
     - The figures are embedded as PNG data, because the page must be a single file.
 """
 
@@ -25,7 +25,6 @@ from .page_html import (
     render_facts,
     render_folds,
     render_note,
-    render_scrolling,
     render_section,
     render_table,
 )
@@ -40,7 +39,7 @@ _LONG_NAMES = {
     "twins": "twins, runs with a small push",
     "log": "the log itself",
 }
-"""Names of the checks on the page, by their names on a terminal."""
+"""Mapping from the name of a check on a terminal to its name on the page."""
 _SYMBOLS = (
     ("q, qd", "angle of a joint, in rad, and its speed, in rad/s"),
     (
@@ -58,7 +57,7 @@ _SYMBOLS = (
     ("V", "energy function of the paper's stability theorem, in J"),
     ("β", "weight of an arm in V"),
 )
-"""Symbols of the page with their meanings."""
+"""Symbols used on the page, with their meanings."""
 _BALANCE_NOTE = (
     "V is the energy function of the stability theorem: a weighted sum of the energies of the "
     "arms, of their errors and of the estimates. The sum "
@@ -69,12 +68,12 @@ _BALANCE_NOTE = (
 def render_certificate(log: Log, certificate: Certificate) -> Markup:
     """Renders the section of the report that explains why a run was judged stable or not.
 
-    The section contains the reasons as sentences, and tables and figures that a reader can
-    unfold. The judgement itself is at the beginning of the page.
+    The section contains the reasons as sentences, with collapsible tables and figures. The
+    verdict itself is at the top of the page.
 
     Args:
         log: Log of the run.
-        certificate: Judgement whether the run was stable, with its reasons.
+        certificate: Stability certificate of the run.
     """
     _, *grounds = describe_certificate(certificate)
     lines = [
@@ -120,28 +119,28 @@ def render_certificate(log: Log, certificate: Certificate) -> Markup:
 
 
 def _lengthen_name(sentence: str) -> str:
-    """Replaces the short name at the beginning of a sentence by a name for readers of the page.
+    """Replaces the short name at the start of a sentence with a name for readers of the page.
 
-    Each sentence of `describe_certificate` begins with the name of a check and a colon. The
-    short names fit a terminal. A name that is not in `_LONG_NAMES` remains, as does a sentence
-    without a colon.
+    Each sentence of `describe_certificate` starts with the name of a check and a colon. The
+    short names are made for a terminal. Names that are not in `_LONG_NAMES`, and sentences
+    without a colon, are left unchanged.
     """
     name, colon, rest = sentence.partition(": ")
     return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
 
 
 def _render_premises(certificate: Certificate) -> Markup:
-    """Returns the table of the premises, which are the conditions of the stability theorem."""
+    """Renders the table of the premises of the stability theorem."""
     table = render_macro("certificate.html", "premises", premises=certificate.premises)
-    return render_scrolling(table, "premises")
+    return render_macro("parts.html", "scrolling", content=table, label="premises")
 
 
 def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Figure]]:
     """Draws the figures that show why a run was judged stable or not.
 
-    There is a figure for each kind of evidence: the energy function of the stability proof,
-    energies that the control laws record themselves, and repetitions of the run with a small
-    push (twins), whose effect grows or decays.
+    There is one figure per kind of evidence: the energy function of the stability proof,
+    energies recorded by the control laws themselves, and twins (repetitions of the run with a
+    small push whose effect grows or decays).
 
     Returns:
         Title and figure of each.
@@ -162,7 +161,7 @@ def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Fig
 
 
 def _render_picture(title: str, figure: Figure) -> Markup:
-    """Returns a figure as an image with embedded PNG data."""
+    """Renders a figure as an image with embedded PNG data."""
     drawing = io.BytesIO()
     figure.savefig(drawing, format="png", dpi=_PAGE_DPI)
     data = base64.b64encode(drawing.getvalue()).decode()

@@ -1,12 +1,11 @@
-"""Renders the empty containers on a report's page into which its scripts draw charts and arms.
+"""Renders the empty containers into which a report's scripts draw charts and arms.
 
-A report is a web page about a recorded run of several robot arms. The scripts `report.js` and
-`arms.js` draw the charts and the moving arms in the browser, into empty containers.
+The scripts `report.js` and `arms.js` fill the containers in the browser.
 
 Invariant:
-    - Each group of charts can be unfolded. At first at most `_MOST_OPEN_CHARTS` charts are
-      unfolded.
-    - The page names the charts for which the log has no value.
+    - Each group of charts is collapsible. At most `_MOST_OPEN_CHARTS` charts are expanded
+      initially.
+    - The page lists the charts for which the log has no data.
 """
 
 import tomllib
@@ -24,21 +23,21 @@ from .figures.joint_motion import explain_absent_operator
 from .html_templates import render_macro
 from .page_data import Chart
 from .page_html import render_details, render_note
-from .page_leaders import describe_leads, render_lead_bars
 
 _TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.presentation") / "assets" / "report.toml").read_text("utf-8")
 )
-"""Heading and note of each section of charts, by part of the page and section, and other notes.
+"""Heading and note of each section of charts, keyed by part of the page and section, and other
+notes.
 """
 _OPEN_SECTIONS = ("torques", "errors", "positions")
-"""Sections of charts that may be unfolded at first."""
+"""Sections of charts that may be expanded initially."""
 _MOST_OPEN_CHARTS = 10
-"""Largest number of charts in a part of the page that are unfolded at first."""
+"""Maximum number of charts in a part of the page that are expanded initially."""
 _MOST_HALF_CHARTS = 2
-"""Largest number of charts in a group that takes half of the width of the page."""
+"""Maximum number of charts in a group that occupies half the width of the page."""
 _NO_VALUE = "the log has no value to draw"
-"""Reason why a chart is left out."""
+"""Reason why a chart is omitted."""
 
 _ARM_NOTE = (
     "Solid: the arm; dashed: where the other arms lead it, delayed and weighted. The arms "
@@ -49,20 +48,25 @@ _ARM_NOTE = (
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
     """Renders the top of a report: the moving arms, the leading users, errors and delays.
 
-    A reader who opens the page should understand the run without reading further.
+    This part lets a reader understand the run without reading further.
 
     Args:
         log: Log of the run.
-        builder: Builder of the charts, which provides the box around the motion and the scale.
+        builder: Builder of the charts, which provides the bounding box of the motion and the
+            scale.
         charts: Charts of the page.
     """
     html = Markup()
     has_records = any(len(log[site]) for site in log.sites)
     if has_records:
         html += render_macro("charts.html", "arm_player")
-        html += render_lead_bars(log, builder.leads)
-        sentences = [*describe_leads(log, builder.leads), _ARM_NOTE]
-        html += render_note(" ".join(sentences))
+        sentences = []
+        for lead in builder.leads:
+            if lead.is_constant:
+                sentences.append(lead.describe_constant(log.scenario))
+            else:
+                html += lead.render_bar(log)
+        html += render_note(" ".join([*sentences, _ARM_NOTE]))
 
     empty_sites = [site for site in log.sites if not len(log[site])]
     if empty_sites:
@@ -80,16 +84,16 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
 def render_chart_groups(
     log: Log, place: str, charts: Sequence[Chart], missing: Mapping[str, Sequence[str]]
 ) -> Markup:
-    """Renders a section's groups of charts, and a note about the charts that the page lacks.
+    """Renders the chart groups of a section, with a note about the missing charts.
 
-    At first only a limited number of charts is unfolded, so that the page is quick to draw.
+    Only a limited number of charts is expanded initially, so that the page is drawn quickly.
 
     Args:
         log: Log of the run.
-        place: Part of the page, which is the name of a table in `report.toml`, such as "motion"
+        place: Part of the page, given as the name of a table in `report.toml`, such as "motion"
             or "links".
         charts: Charts of the page.
-        missing: Titles of the charts for which the log has no value, by section.
+        missing: Mapping from section to the titles of charts for which the log has no data.
     """
     has_chains = any(arm.chain for arm in log.scenario.arms.values())
     absence_reasons = {
@@ -134,17 +138,17 @@ def render_chart_groups(
 def _render_group(
     section: str, heading: str, note: str, count: int, is_open: bool, is_small: bool
 ) -> Markup:
-    """Renders a group of charts that readers can unfold.
+    """Renders a collapsible group of charts.
 
-    The group is an empty container, into which a script of the page draws the charts.
+    The group is an empty container, which a script of the page fills with charts.
 
     Args:
         section: Key of the section, as in `report.toml`.
         heading: Heading of the group.
         note: Sentence about the charts.
         count: Number of charts.
-        is_open: True if the group is unfolded at first.
-        is_small: True for small charts without legends, of which there are many.
+        is_open: True to expand the group initially.
+        is_small: True for small charts without legends, used if there are many.
     """
     return render_macro(
         "charts.html",

@@ -1,17 +1,16 @@
 """Defines the data that the web page of a report contains for its scripts.
 
-The scripts `report.js` and `arms.js` draw charts and moving arms in the browser. They read one
-`PageData` as JSON, which `charts.ChartBuilder` computes. Long columns of numbers are encoded as
-base64.
+The scripts `report.js` and `arms.js` draw charts and moving arms in the browser. They read a
+single `PageData` object as JSON, computed by `charts.ChartBuilder`. Long columns of numbers are
+base64-encoded.
 
 Invariant:
-    - These types are the contract between the program and the scripts. A script reads only
-      fields that are declared here. The tests of pages in browsers
-      (`tests/page/whole_pages.py`) report every field that a script reads although it was not
-      sent.
-    - Every field is sent, whether or not it has its default value. A script never has to guess
-      the meaning of an absent field.
-    - The field `kind` names the kind of a chart or an arm. A script never infers the kind from
+    - These types are the contract between the program and the scripts. Scripts read only fields
+      declared here. The browser tests of the pages (`tests/page/whole_pages.py`) report every
+      field that a script reads but that was not sent.
+    - Every field is sent, even if it has its default value. Scripts never have to guess what an
+      absent field means.
+    - The field `kind` states the kind of a chart or an arm. Scripts never infer the kind from
       other fields.
 """
 
@@ -22,122 +21,68 @@ import msgspec
 Colour = int | Literal["limit"]
 """Index of a site in the palette of the page, or "limit".
 
-The lines of references, true values and limits have the colour "limit".
+Lines for references, true values and limits have the colour "limit".
 """
 
 
-class ColumnTable(msgspec.Struct, frozen=True):
-    """Values of one arm over time, as the report's web page contains them.
-
-    A table has one row per shown tick (control period). The lines of charts refer to its
-    columns.
-
-    Attributes:
-        rate_hz: Tick rate of the site, which converts ticks to times.
-        tick: Ticks of the rows, as base64 of little-endian int32.
-        columns: Values of each column, as base64 of little-endian float32. NaN stands for a
-            missing value.
-    """
-
-    rate_hz: int
-    tick: str
-    columns: list[str]
-
-
-class TableSeries(msgspec.Struct, frozen=True, kw_only=True):
-    """A line of a chart over time, which draws one column of a `ColumnTable`.
-
-    Several charts may draw from the same table, so that the page contains its values only once.
-
-    Attributes:
-        label: Name of the line in the legend.
-        colour: Colour of the line.
-        table: Index of the table in `PageData.tables`.
-        column: Index of the column in the table.
-        dash: True for a dashed line.
-    """
-
-    label: str
-    colour: Colour
-    table: int
-    column: int
-    dash: bool = False
-
-
-class HistogramSeries(msgspec.Struct, frozen=True):
-    """One line of a histogram, which shows how often the times of an arm lie in each bin.
-
-    The bins belong to the chart, and are the same for all of its lines.
-
-    Attributes:
-        label: Name of the line in the legend.
-        colour: Colour of the line.
-        counts: Number of ticks in each bin.
-    """
-
-    label: str
-    colour: Colour
-    counts: list[int]
-
-
-class DistributionSeries(msgspec.Struct, frozen=True):
-    """One line of a cumulative distribution: the percentage of values up to each x.
-
-    For example, 95 % of the delays are up to 20 ms.
-
-    Attributes:
-        label: Name of the line in the legend.
-        colour: Colour of the line.
-        dash: True for a dashed line.
-        values: Percentages at the chart's `x`, as base64 of little-endian float32.
-    """
-
-    label: str
-    colour: Colour
-    dash: bool
-    values: str
-
-
-class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": "to"}):
-    """Dashed horizontal line in a chart at a value of the scenario, such as the mean delay.
-
-    Readers compare it with the measured values.
-
-    Attributes:
-        value: The value, in the unit of the chart.
-        colour: Colour of the line.
-        from_s: Start of the line, in s. The field is called "from" in JSON.
-        to_s: End of the line, in s. The field is called "to" in JSON.
-    """
-
-    value: float
-    colour: Colour
-    from_s: float
-    to_s: float
-
-
 class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field="kind"):
-    """A chart of a report that shows a quantity, such as joint angles, over time.
+    """A chart that shows a quantity, such as joint angles, over time.
 
     Attributes:
-        section: Key of the section of the page, as in `report.toml`.
+        section: Key of the page section, as in `report.toml`.
         title: Title of the chart.
         unit: Unit of the values.
         series: Lines of the chart.
         sites: Names of the sites whose modes and changes are marked in the chart.
-        lines: Horizontal lines at values that the scenario states, such as a mean delay.
-        links: True if changes of links are also marked, and the horizontal lines are drawn
-            above the series.
+        lines: Horizontal lines at values specified by the scenario, such as a mean delay.
+        links: True to also mark changes of links, and to draw the horizontal lines above the
+            series.
         log: True for a logarithmic value axis.
-        zero: True if the value axis begins at 0.
-        margin: Least space above the values, as a fraction of the largest value.
-        note: Sentences below the chart. Empty for no sentence.
+        zero: True if the value axis starts at 0.
+        margin: Minimum space above the values, as a fraction of the largest value.
+        note: Sentences shown below the chart. Empty for none.
     """
+
+    class Series(msgspec.Struct, frozen=True, kw_only=True):
+        """A line of a chart over time, which plots one column of a `PageData.Table`.
+
+        Several charts can share a table, so that the page contains its values only once.
+
+        Attributes:
+            label: Name of the line in the legend.
+            colour: Colour of the line.
+            table: Index of the table in `PageData.tables`.
+            column: Index of the column in the table.
+            dash: True for a dashed line.
+        """
+
+        label: str
+        colour: Colour
+        table: int
+        column: int
+        dash: bool = False
+
+    class StatedLine(msgspec.Struct, frozen=True, rename={"from_s": "from", "to_s": "to"}):
+        """Dashed horizontal line at a value specified by the scenario, such as the mean delay.
+
+        Readers can compare it with the measured values.
+
+        Attributes:
+            value: The value, in the unit of the chart.
+            colour: Colour of the line.
+            from_s: Start of the line, in s. Called "from" in JSON.
+            to_s: End of the line, in s. Called "to" in JSON.
+        """
+
+        value: float
+        colour: Colour
+        from_s: float
+        to_s: float
 
     section: str
     title: str
     unit: str
-    series: list[TableSeries]
+    series: list[Series]
     sites: list[str]
     lines: list[StatedLine] = []
     links: bool = False
@@ -150,23 +95,38 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
 class HistogramChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"
 ):
-    """A histogram of a duration that is measured in every tick, such as the lateness.
+    """A histogram of a duration measured in every tick, such as the lateness.
 
-    The bins have equal width on a logarithmic axis.
+    The bins have equal widths on a logarithmic axis.
 
     Attributes:
-        section: Key of the section of the page, as in `report.toml`.
+        section: Key of the page section, as in `report.toml`.
         title: Title of the chart.
         unit: Unit of the edges.
         series: Lines of the chart.
-        edges: Edges of the B bins, B + 1 numbers.
-        periods: Tick periods of the sites, in the unit of the edges. They are drawn as limits.
+        edges: The B + 1 edges of the B bins.
+        periods: Tick periods of the sites, in the unit of the edges. Drawn as limits.
     """
+
+    class Series(msgspec.Struct, frozen=True):
+        """One line of a histogram: the number of ticks of one site in each bin.
+
+        All lines of a chart share its bins.
+
+        Attributes:
+            label: Name of the line in the legend.
+            colour: Colour of the line.
+            counts: Number of ticks in each bin.
+        """
+
+        label: str
+        colour: Colour
+        counts: list[int]
 
     section: str
     title: str
     unit: str
-    series: list[HistogramSeries]
+    series: list[Series]
     edges: list[float]
     periods: list[float]
 
@@ -174,10 +134,10 @@ class HistogramChart(
 class DistributionChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="distribution", tag_field="kind"
 ):
-    """A chart of a report that shows cumulative distributions, for example of delays.
+    """A chart that shows cumulative distributions, for example of delays.
 
     Attributes:
-        section: Key of the section of the page, as in `report.toml`.
+        section: Key of the page section, as in `report.toml`.
         title: Title of the chart.
         unit: Unit of `x`.
         series: Lines of the chart.
@@ -185,10 +145,27 @@ class DistributionChart(
         log: True if the horizontal axis is logarithmic.
     """
 
+    class Series(msgspec.Struct, frozen=True):
+        """One line of a cumulative distribution: the percentage of values not exceeding each x.
+
+        For example, 95 % of the delays are at most 20 ms.
+
+        Attributes:
+            label: Name of the line in the legend.
+            colour: Colour of the line.
+            dash: True for a dashed line.
+            values: Percentages at the chart's `x`, as base64 of little-endian float32.
+        """
+
+        label: str
+        colour: Colour
+        dash: bool
+        values: str
+
     section: str
     title: str
     unit: str
-    series: list[DistributionSeries]
+    series: list[Series]
     x: str
     log: bool
 
@@ -196,126 +173,14 @@ class DistributionChart(
 Chart = TimeChart | HistogramChart | DistributionChart
 
 
-class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
-    """Data with which a report draws an arm of two links that moves in a plane.
-
-    Attributes:
-        site: Name of the site, the process that runs the arm.
-        caption: Name and role of the site, such as "m1, master 1".
-        colour: Number that selects the colour of the arm.
-        table: Index of the table that the picture uses. It contains the actual and the desired
-            angles of both joints, in rad, and then the outlines of the bodies.
-        bodies: Number of bodies that the arm can touch.
-        links_m: Lengths of the links, in units of the picture.
-    """
-
-    site: str
-    caption: str
-    colour: int
-    table: int
-    bodies: int
-    links_m: list[float]
-
-
-class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
-    """Data with which a report draws an arm that moves in space, as a picture in a plane.
-
-    Attributes:
-        site: Name of the site, the process that runs the arm.
-        caption: Name and role of the site, such as "m1, master 1".
-        colour: Number that selects the colour of the arm.
-        table: Index of the table with the coordinates to draw. It contains the points of the
-            actual arm, of the arm in the desired pose, and of the shadow on the floor, and then
-            the outlines of the bodies.
-        bodies: Number of bodies that the arm can touch.
-        points: Number of points of an arm: the joints without the base, and the end effector.
-    """
-
-    site: str
-    caption: str
-    colour: int
-    table: int
-    bodies: int
-    points: int
-
-
-class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
-    """Data of a bar that shows which arms lead a slave arm over time.
-
-    A slave follows its peers, the other arms, with weights, the dominance factors. Between two
-    points in time the factors change linearly.
-
-    Attributes:
-        site: Name of the slave.
-        peers: Names of the peers.
-        t: Times of the points, in s.
-        shares: For each peer its dominance factor at these times.
-    """
-
-    site: str
-    peers: list[str]
-    t: list[float]
-    shares: list[list[float]]
-
-
-class MarkedChange(msgspec.Struct, frozen=True):
-    """A change during the run that charts mark, such as a new delay of a link.
-
-    The number n connects the mark with the row of the table that explains the change.
-
-    Attributes:
-        n: Number in the table of changes.
-        t: Time from which the change applies, in s.
-        site: Name of the site that applies the change.
-        link: The changed link. Empty for a change of another kind.
-    """
-
-    n: int
-    t: float
-    site: str
-    link: str
-
-
-class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
-    """An interval, shaded in charts, in which an arm did not follow the others.
-
-    The page receives it as a JSON list.
-
-    Attributes:
-        colour: Index of the site, on which its colour depends.
-        mode: Mode of the site.
-        from_s: Start of the interval, in s.
-        to_s: End of the interval, in s.
-    """
-
-    colour: int
-    mode: str
-    from_s: float
-    to_s: float
-
-
-class Palettes(msgspec.Struct, frozen=True):
-    """Colours of the arms for light and for dark screens.
-
-    The colours are in the order of the scenario, as CSS writes them: "#004488".
-
-    Attributes:
-        light: Colours for light screens.
-        dark: Colours for dark screens.
-    """
-
-    light: list[str]
-    dark: list[str]
-
-
 class PageData(msgspec.Struct, frozen=True, kw_only=True):
-    """All data that the scripts of a report's web page draw.
+    """All data drawn by the scripts of a report's web page.
 
     Attributes:
         end_s: End of the time axis, in s.
         colours: Colours of the sites.
-        tables: Tables of numbers, to which charts and arms refer by index.
-        charts: Charts in the order of the page.
+        tables: Numerical tables, referred to by index from charts and arms.
+        charts: Charts in page order.
         changes: Changes during the run.
         spans: For each site, the intervals in which it does not follow its peers.
         arms: Arms of the sites that have records.
@@ -324,9 +189,131 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
             pictures.
     """
 
+    class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
+        """Data for drawing an arm with two links that moves in a plane.
+
+        Attributes:
+            site: Name of the site.
+            caption: Name and role of the site, such as "m1, master 1".
+            colour: Index that selects the colour of the arm.
+            table: Index of the table with the data to draw. Its columns are the actual and the
+                desired angles of both joints, in rad, followed by the outlines of the bodies.
+            bodies: Number of bodies that the arm can touch.
+            links_m: Lengths of the links, in picture units.
+        """
+
+        site: str
+        caption: str
+        colour: int
+        table: int
+        bodies: int
+        links_m: list[float]
+
+    class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
+        """Data for drawing an arm that moves in space, projected onto a plane.
+
+        Attributes:
+            site: Name of the site.
+            caption: Name and role of the site, such as "m1, master 1".
+            colour: Index that selects the colour of the arm.
+            table: Index of the table with the coordinates to draw: the points of the actual
+                arm, of the arm in the desired pose, and of the shadow on the floor, followed by
+                the outlines of the bodies.
+            bodies: Number of bodies that the arm can touch.
+            points: Number of points of an arm: the joints, excluding the base, and the end
+                effector.
+        """
+
+        site: str
+        caption: str
+        colour: int
+        table: int
+        bodies: int
+        points: int
+
+    class Table(msgspec.Struct, frozen=True):
+        """Values of one arm over time, as stored in the report's web page.
+
+        A table has one row per displayed tick. The lines of charts refer to its columns.
+
+        Attributes:
+            rate_hz: Tick rate of the site, used to convert ticks to times.
+            tick: Ticks of the rows, as base64 of little-endian int32.
+            columns: Values of each column, as base64 of little-endian float32. NaN marks a
+                missing value.
+        """
+
+        rate_hz: int
+        tick: str
+        columns: list[str]
+
+    class MarkedChange(msgspec.Struct, frozen=True):
+        """A change during the run that is marked in charts, such as a new delay of a link.
+
+        The number n links the mark to the table row that explains the change.
+
+        Attributes:
+            n: Number in the table of changes.
+            t: Time from which the change applies, in s.
+            site: Name of the site that applies the change.
+            link: The changed link. Empty for other kinds of change.
+        """
+
+        n: int
+        t: float
+        site: str
+        link: str
+
+    class ModeSpan(msgspec.Struct, frozen=True, array_like=True):
+        """An interval in which an arm did not follow the others, shaded in charts.
+
+        It is sent to the page as a JSON list.
+
+        Attributes:
+            colour: Index of the site, which determines the colour.
+            mode: Mode of the site.
+            from_s: Start of the interval, in s.
+            to_s: End of the interval, in s.
+        """
+
+        colour: int
+        mode: str
+        from_s: float
+        to_s: float
+
+    class Palettes(msgspec.Struct, frozen=True):
+        """Colours of the arms for light and for dark screens.
+
+        The colours are in scenario order, in CSS notation such as "#004488".
+
+        Attributes:
+            light: Colours for light screens.
+            dark: Colours for dark screens.
+        """
+
+        light: list[str]
+        dark: list[str]
+
+    class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
+        """Data for a bar that shows which arms lead a slave arm over time.
+
+        Dominance factors change linearly between two consecutive points in time.
+
+        Attributes:
+            site: Name of the slave.
+            peers: Names of the peers.
+            t: Times of the points, in s.
+            shares: For each peer, its dominance factor at these times.
+        """
+
+        site: str
+        peers: list[str]
+        t: list[float]
+        shares: list[list[float]]
+
     end_s: float
     colours: Palettes
-    tables: list[ColumnTable]
+    tables: list[Table]
     charts: list[Chart]
     changes: list[MarkedChange]
     spans: dict[str, list[ModeSpan]]
@@ -335,6 +322,6 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:
-        """Converts the data to lists and dictionaries, which the page contains as JSON."""
+        """Converts the data to lists and dictionaries, which the page stores as JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return plain

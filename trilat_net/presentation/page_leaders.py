@@ -1,51 +1,48 @@
-"""Renders bars in a report that show which user leads the slave arm at each time.
+"""Renders bars in a report that show which user leads the slave arm over time.
 
-A slave arm may follow several master arms, each with a weight, the dominance factor. The master
-with the larger factor leads. The factors may change during a run, for example when a trainer
-takes over from a trainee. The bars are below the moving arms of the report.
+A slave can follow several masters, each weighted by a dominance factor. The master with the
+largest factor leads. The factors may change during a run, for example when a trainer takes over
+from a trainee. The bars are shown below the moving arms of the report.
 
 Invariant:
-    - The factors are those with which the slave computed, from the scenario and the records.
+    - The factors are those that the slave used, taken from the scenario and the records.
     - For a slave whose factors never change, a sentence replaces the bar.
-    - The bar has the time axis of the slider that moves the arms.
+    - The bar has the same time axis as the slider that moves the arms.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import DominanceHistory, DominancePlan, Timeline
+from ..analysis import DominanceHistory, Timeline
 from ..core import Array
 from ..errors import join_words
 from ..log import Log
 from ..scenario import Scenario
 from .html_templates import render_macro
-from .page_data import LeadBar
+from .page_data import PageData
 
 _MAX_BARS = 4
-"""Largest number of slaves with a bar or a sentence."""
+"""Maximum number of slaves with a bar or a sentence."""
 _MAX_PHASES = 6
-"""Largest number of spans of time that the text beside a bar describes."""
+"""Maximum number of time spans described in the text beside a bar."""
 _INSTANTS = 600
 """Number of equally spaced instants at which the factors are computed."""
 _STEP_S = 1e-6
 """Time before a sudden change at which the old factors still apply, in s."""
 _SAME_SHARE = 1e-9
-"""Largest difference of two factors that count as equal."""
+"""Maximum difference between two factors that are considered equal."""
 
 
-class _Lead(NamedTuple):
-    """The weights with which each user's arm leads the slave arm over time.
-
-    The slave follows the arms of several users, each with a dominance factor from 0 to 1.
+class SlaveLead(NamedTuple):
+    """The dominance factors with which a slave arm follows its peers over time.
 
     Attributes:
         slave: Name of the slave.
-        peers: Names of the P peers that the slave follows at some time.
+        peers: Names of the P peers that the slave follows at any time in the run.
         t_s: Times of the K points between which the factors change linearly, in s.
-        shares: Dominance factor of each peer at these times, shape (K, P).
+        shares: Dominance factor of each peer at these times, from 0 to 1, shape (K, P).
     """
 
     slave: str
@@ -55,81 +52,160 @@ class _Lead(NamedTuple):
 
     @property
     def is_constant(self) -> bool:
-        """True if no weight with which the slave arm follows the others changes during the run.
+        """True if none of the slave's dominance factors change during the run.
 
-        A sentence then describes the weights completely, and a bar over time would show
+        In that case a sentence describes the factors completely, and a bar over time would add
         nothing.
         """
         return len(self.t_s) < 2 or bool(np.ptp(self.shares, axis=0).max() <= _SAME_SHARE)
 
+    @classmethod
+    def list_of_log(cls, log: Log) -> list["SlaveLead"]:
+        """Returns the dominance factors of each slave in a log over the run.
 
-def _name_role(scenario: Scenario, site: str) -> str:
-    """Returns the role of an arm in words: "master 2", or "slave" if there is only one.
+        The bars, the sentences and the slider of the page use these data.
 
-    Args:
-        scenario: Scenario of the run.
-        site: Name of the site.
-    """
-    role = scenario.sites[site].role
-    with_role = [name for name, spec in scenario.sites.items() if spec.role == role]
-    return role if len(with_role) == 1 else f"{role} {with_role.index(site) + 1}"
+        Args:
+            log: Log of the run.
 
+        Returns:
+            One entry per slave that has records and follows another arm, at most `_MAX_BARS`
+            entries.
+        """
+        leads = []
+        for site, site_settings in log.scenario.sites.items():
+            if site_settings.role == "slave" and len(log[site]):
+                lead = cls._trace(log, site)
+                if lead.peers:
+                    leads.append(lead)
+        return leads[:_MAX_BARS]
 
-def caption_site(scenario: Scenario, site: str) -> str:
-    """Returns the caption of an arm in the drawing, for example "m1, master 1"."""
-    return f"{site}, {_name_role(scenario, site)}"
+    @classmethod
+    def _trace(cls, log: Log, slave: str) -> "SlaveLead":
+        """Computes the dominance factors with which a slave follows its peers.
 
+        The points are those at which the slope of any factor changes, so that straight lines
+        between them represent the factors at all times.
+        """
+        end_s = Timeline(log).end_s
 
-def trace_leads(log: Log) -> list[_Lead]:
-    """Returns the weights with which each slave arm follows the other arms over the run.
+        # Candidates: equal steps, and the start and the end of each ramp. A point just before
+        # the start shows a jump as a vertical line.
+        times_s = [np.linspace(0.0, end_s, _INSTANTS)]
+        for start_s, end_of_ramp_s in DominanceHistory.list_ramp_spans_s(log, slave):
+            times_s.append(np.array([start_s - _STEP_S, start_s, end_of_ramp_s]))
+        t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))
 
-    The bars, the sentences and the slider of the page use these data.
+        factors = DominanceHistory.of_log(log, slave, t_s).alpha
+        followed = np.flatnonzero(factors.max(axis=0) > 0.0)
+        peers = [log.scenario.peers(slave)[index] for index in followed]
+        factors_of_followed = factors[:, followed]
+        corners = _find_corners(t_s, factors_of_followed)
+        return cls(slave, peers, t_s[corners], factors_of_followed[corners])
 
-    Args:
-        log: Log of the run.
+    @property
+    def bar(self) -> PageData.LeadBar:
+        """Data from which a script of the page shows who leads the slave at a selected time."""
+        return PageData.LeadBar(
+            site=self.slave,
+            peers=self.peers,
+            t=self.t_s.tolist(),
+            shares=self.shares.T.tolist(),
+        )
 
-    Returns:
-        An entry for each slave that has records and follows another arm, at most `_MAX_BARS`
-        entries.
-    """
-    leads = []
-    for site, site_settings in log.scenario.sites.items():
-        if site_settings.role == "slave" and len(log[site]):
-            lead = _trace_lead(log, site)
-            if lead.peers:
-                leads.append(lead)
-    return leads[:_MAX_BARS]
+    def describe_constant(self, scenario: Scenario) -> str:
+        """Returns a sentence that says who leads the slave, for factors that never change.
 
+        For example: "m1 leads the slave with 80 % and m2 with 20 %, during the whole run."
 
-def _trace_lead(log: Log, slave: str) -> _Lead:
-    """Returns the weights (dominance factors) with which a slave follows its peers over time.
+        Args:
+            scenario: Scenario of the run.
+        """
+        slave = _name_slave(scenario, self.slave)
+        first, *others = self.peers
+        if not others:
+            return f"{first} alone leads {slave}, during the whole run."
+        phrases = [f"{first} leads {slave} with {_format_percent(self.shares[0, 0])}"]
+        for peer, factor in zip(others, self.shares[0, 1:], strict=True):
+            phrases.append(f"{peer} with {_format_percent(factor)}")
+        return f"{join_words(phrases)}, during the whole run."
 
-    The points are those at which the slopes of the weights change. Straight lines between the
-    points therefore show the weights at all times.
-    """
-    end_s = Timeline(log).end_s
+    def describe_phases(self) -> str:
+        """Returns a text that says who leads at which times.
 
-    # Candidates: equal steps, and the start and the end of each ramp. A point just before the
-    # start shows a jump as a vertical line.
-    times_s = [np.linspace(0.0, end_s, _INSTANTS)]
-    for ramp in DominancePlan.of_log(log, slave).ramps:
-        start_s = ramp.start_ns * 1e-9
-        times_s.append(np.array([start_s - _STEP_S, start_s, ramp.end_ns * 1e-9]))
-    t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))
+        An example is "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %". Ramps are
+        omitted, because the time spans on either side show the factors before and after the
+        ramp. Only the first `_MAX_PHASES` spans are listed, followed by the number of remaining
+        ones.
+        """
+        phase_texts = []
+        first_point = 0
+        for index in range(1, len(self.t_s) + 1):
+            is_last = index == len(self.t_s)
+            if not is_last:
+                change = np.abs(self.shares[index] - self.shares[first_point]).max()
+                if change <= _SAME_SHARE:
+                    continue  # the phase of constant shares continues
 
-    factors = DominanceHistory.of_log(log, slave, t_s).alpha
-    followed = np.flatnonzero(factors.max(axis=0) > 0.0)
-    peers = [log.scenario.peers(slave)[index] for index in followed]
-    factors_of_followed = factors[:, followed]
-    corners = _find_corners(t_s, factors_of_followed)
-    return _Lead(slave, peers, t_s[corners], factors_of_followed[corners])
+            is_longer_than_a_point = index - 1 > first_point  # otherwise within a ramp
+            if is_longer_than_a_point:
+                from_s = self.t_s[first_point]
+                to_s = self.t_s[index - 1]
+                span = f"from {from_s:.4g} s" if is_last else f"{from_s:.4g} to {to_s:.4g} s"
+                phase_texts.append(f"{span}: {self._list_shares(first_point)}")
+            first_point = index
+
+        if not phase_texts:
+            end = len(self.t_s) - 1
+            phase_texts = [
+                f"at first {self._list_shares(0)}",
+                f"at the end {self._list_shares(end)}",
+            ]
+
+        if len(phase_texts) > _MAX_PHASES:
+            unlisted_count = len(phase_texts) - _MAX_PHASES
+            phase_texts = [*phase_texts[:_MAX_PHASES], f"and {unlisted_count} more"]
+        return "; ".join(phase_texts)
+
+    def render_bar(self, log: Log) -> Markup:
+        """Returns a bar showing how much the slave follows each peer over time, as SVG.
+
+        The areas of the peers are stacked and together fill the bar. The height of an area is
+        the dominance factor of its peer.
+
+        Args:
+            log: Log of the run.
+        """
+        end_s = Timeline(log).end_s
+        tops = 1.0 - np.cumsum(self.shares, axis=1)
+        bottoms = tops + self.shares
+        peers = []
+        for column, peer in enumerate(self.peers):
+            # The outline of an area runs along its upper edge and back along its lower edge.
+            upper = _list_points(self.t_s, tops[:, column])
+            lower = _list_points(self.t_s[::-1], bottoms[::-1, column])
+            points = " ".join([*upper, *lower])
+            peers.append({"name": peer, "index": log.sites.index(peer), "points": points})
+        return render_macro(
+            "charts.html",
+            "lead_bar",
+            slave=_name_slave(log.scenario, self.slave),
+            peers=peers,
+            phases=self.describe_phases(),
+            end_s=f"{end_s:.6g}",
+        )
+
+    def _list_shares(self, index: int) -> str:
+        """Returns the percentages of all peers at a point, such as "m1 90 %, m2 10 %"."""
+        shares = zip(self.peers, self.shares[index], strict=True)
+        return ", ".join(f"{peer} {_format_percent(share)}" for peer, share in shares)
 
 
 def _find_corners(t_s: Array, shares: Array) -> list[int]:
-    """Returns the indices of the points that are needed to draw weights over time as a line.
+    """Returns the indices of the points needed to draw factors over time as a line.
 
-    Points on a straight line between other points are left out. The first and the last point
-    are kept.
+    Points on a straight line between other points are omitted. The first and the last point are
+    kept.
     """
     slopes = np.diff(shares, axis=0) / np.diff(t_s)[:, np.newaxis]
     turns = np.abs(np.diff(slopes, axis=0)).max(axis=1, initial=0.0)
@@ -137,155 +213,18 @@ def _find_corners(t_s: Array, shares: Array) -> list[int]:
     return [0, *corners.tolist(), len(t_s) - 1]
 
 
-def list_lead_bars(leads: Sequence[_Lead]) -> list[LeadBar]:
-    """Returns the data from which a script of the page shows who leads at a chosen time.
-
-    Slaves whose weights never change are left out, because a sentence describes them.
-
-    Args:
-        leads: Weights of each slave, from `trace_leads`.
-    """
-    bars = []
-    for lead in leads:
-        if not lead.is_constant:
-            bar = LeadBar(
-                site=lead.slave,
-                peers=lead.peers,
-                t=lead.t_s.tolist(),
-                shares=lead.shares.T.tolist(),
-            )
-            bars.append(bar)
-    return bars
-
-
-def render_lead_bars(log: Log, leads: Sequence[_Lead]) -> Markup:
-    """Renders a bar for each slave arm, whose areas show who leads the arm over time.
-
-    Slaves whose dominance factors never change have no bar.
-
-    Args:
-        log: Log of the run.
-        leads: Weights of each slave, from `trace_leads`.
-    """
-    return Markup().join(_render_bar(log, lead) for lead in leads if not lead.is_constant)
-
-
-def describe_leads(log: Log, leads: Sequence[_Lead]) -> list[str]:
-    """Returns a sentence on who leads, for each slave arm whose weights never change.
-
-    The other slaves have bars, see `render_lead_bars`.
-
-    Args:
-        log: Log of the run.
-        leads: Weights of each slave, from `trace_leads`.
-    """
-    return [_describe_constant_lead(log.scenario, lead) for lead in leads if lead.is_constant]
-
-
-def _describe_constant_lead(scenario: Scenario, lead: _Lead) -> str:
-    """Returns a sentence that says who leads a slave whose weights never change.
-
-    For example: "m1 leads the slave with 80 % and m2 with 20 %, during the whole run."
-
-    Args:
-        scenario: Scenario of the run.
-        lead: Weights with which the slave follows its peers.
-    """
-    slave = _name_slave(scenario, lead.slave)
-    first, *others = lead.peers
-    if not others:
-        return f"{first} alone leads {slave}, during the whole run."
-    phrases = [f"{first} leads {slave} with {_format_percent(lead.shares[0, 0])}"]
-    for peer, factor in zip(others, lead.shares[0, 1:], strict=True):
-        phrases.append(f"{peer} with {_format_percent(factor)}")
-    return f"{join_words(phrases)}, during the whole run."
-
-
-def describe_phases(lead: _Lead) -> str:
-    """Returns a text on who leads at which times.
-
-    An example is "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %".
-    Ramps between two spans are left out, because these spans show the weights before and after
-    the ramp. If there are more than `_MAX_PHASES` spans, only the number of the remaining ones
-    is stated.
-
-    Args:
-        lead: Weights with which the slave follows its peers.
-    """
-    phase_texts = []
-    first_point = 0
-    for index in range(1, len(lead.t_s) + 1):
-        is_last = index == len(lead.t_s)
-        if not is_last:
-            change = np.abs(lead.shares[index] - lead.shares[first_point]).max()
-            if change <= _SAME_SHARE:
-                continue  # the phase of constant shares continues
-
-        is_longer_than_a_point = index - 1 > first_point  # otherwise within a ramp
-        if is_longer_than_a_point:
-            from_s = lead.t_s[first_point]
-            to_s = lead.t_s[index - 1]
-            span = f"from {from_s:.4g} s" if is_last else f"{from_s:.4g} to {to_s:.4g} s"
-            phase_texts.append(f"{span}: {_list_shares(lead, first_point)}")
-        first_point = index
-
-    if not phase_texts:
-        end = len(lead.t_s) - 1
-        phase_texts = [
-            f"at first {_list_shares(lead, 0)}",
-            f"at the end {_list_shares(lead, end)}",
-        ]
-
-    if len(phase_texts) > _MAX_PHASES:
-        unlisted_count = len(phase_texts) - _MAX_PHASES
-        phase_texts = [*phase_texts[:_MAX_PHASES], f"and {unlisted_count} more"]
-    return "; ".join(phase_texts)
-
-
-def _render_bar(log: Log, lead: _Lead) -> Markup:
-    """Returns a bar that shows over time how much a slave follows each of its peers, as SVG.
-
-    The areas of the peers are stacked. The height of an area is the weight of its peer, and the
-    areas together fill the bar.
-    """
-    end_s = Timeline(log).end_s
-    tops = 1.0 - np.cumsum(lead.shares, axis=1)
-    bottoms = tops + lead.shares
-    peers = []
-    for column, peer in enumerate(lead.peers):
-        # The outline of an area runs along its upper edge and back along its lower edge.
-        upper = _list_points(lead.t_s, tops[:, column])
-        lower = _list_points(lead.t_s[::-1], bottoms[::-1, column])
-        points = " ".join([*upper, *lower])
-        peers.append({"name": peer, "index": log.sites.index(peer), "points": points})
-    return render_macro(
-        "charts.html",
-        "lead_bar",
-        slave=_name_slave(log.scenario, lead.slave),
-        peers=peers,
-        phases=describe_phases(lead),
-        end_s=f"{end_s:.6g}",
-    )
-
-
 def _list_points(t_s: Array, heights: Array) -> list[str]:
-    """Returns points of an SVG shape, with the time in s to the right."""
+    """Formats points for an SVG shape, with time in s increasing to the right."""
     points = zip(t_s.tolist(), heights.tolist(), strict=True)
     return [f"{time_s:.6g},{height:.4f}" for time_s, height in points]
 
 
-def _list_shares(lead: _Lead, index: int) -> str:
-    """Returns the percentages of all peers at a point, such as "m1 90 %, m2 10 %"."""
-    shares = zip(lead.peers, lead.shares[index], strict=True)
-    return ", ".join(f"{peer} {_format_percent(share)}" for peer, share in shares)
-
-
 def _name_slave(scenario: Scenario, slave: str) -> str:
-    """Returns "the slave", with its name if there are several slaves."""
+    """Returns "the slave", including its name if there are several slaves."""
     roles = [spec.role for spec in scenario.sites.values()]
     return "the slave" if roles.count("slave") == 1 else f"the slave {slave}"
 
 
 def _format_percent(share: float) -> str:
-    """Returns a dominance factor in percent, with three digits."""
+    """Formats a dominance factor as a percentage with three digits."""
     return f"{100.0 * share:.3g} %"

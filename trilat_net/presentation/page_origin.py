@@ -1,10 +1,10 @@
 """Renders the section of a report that says how the run was executed and how to repeat it.
 
-It contains the description of the scenario (the experiment), the facts about the recording, the
-commands that check and repeat the run, the assumptions, and the versions of the software.
+The section contains the description of the scenario, facts about the recording, the commands
+that check and repeat the run, the assumptions, and the software versions.
 
 Invariant:
-    - All parts of this section are folded, except the commands.
+    - All parts of this section except the commands are collapsed.
 """
 
 import shlex
@@ -15,12 +15,16 @@ from markupsafe import Markup
 
 from ..errors import count_nouns, join_words
 from ..log import Log, describe_unknown_ends
-from ..own_code import find_user_laws
 from ..results import JsonObject
-from ..scenario import Scenario, compare_scenarios, list_arm_notes, list_shipped, load_scenario
+from ..scenario import (
+    Scenario,
+    ScenarioDifference,
+    list_arm_notes,
+    list_shipped,
+    load_scenario,
+)
 from .html_templates import render_macro
 from .page_html import (
-    render_code,
     render_details,
     render_facts,
     render_folds,
@@ -31,18 +35,18 @@ from .page_timeline import describe_dominance
 _STATED_KEYS = ("seed", "duration_s")
 """Settings that are already shown next to the title."""
 _MAX_CHANGES = 3
-"""Largest number of changed settings in the head of the page."""
+"""Maximum number of changed settings at the top of the page."""
 
 
 def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
-    """Renders the section of a report with which a reader can repeat the run.
+    """Renders the section of a report that lets a reader repeat the run.
 
-    The section contains the commands, the scenario, the assumptions and the versions.
+    The section contains the commands, the scenario, the assumptions and the software versions.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
-        licence: Licence of the plotting library in the page.
+        facts: Key figures of the run, from `summarise_run`.
+        licence: Licence of the plotting library embedded in the page.
     """
     scenario = log.scenario
     name, hint = _find_scenario_argument(scenario)
@@ -51,13 +55,13 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     folds = [
         render_details("What this scenario is about", _render_description(scenario)),
         render_details("What is assumed", _render_assumptions(scenario)),
-        render_details(f"The resolved scenario, {hint}", render_code(scenario.text)),
+        render_details(f"The resolved scenario, {hint}", _render_code(scenario.text)),
         render_details("The recording", render_facts(recording)),
         render_details("Versions of the software", render_facts(_list_versions(log))),
-        render_details("Licence of the plotting library", render_code(licence)),
+        render_details("Licence of the plotting library", _render_code(licence)),
     ]
 
-    body = render_code(_list_commands(log, name)) + render_folds(folds)
+    body = _render_code(_list_commands(log, name)) + render_folds(folds)
     intro = "These commands check the log, simulate its run again, and run its scenario."
 
     law_files = _list_law_files(scenario)
@@ -70,7 +74,7 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
 
 
 def summarise_origin(log: Log) -> str:
-    """Returns the name, length and origin of a run in one line, for the head of the page.
+    """Returns the name, length and origin of a run on one line, for the top of the page.
 
     The origin is, for example, a live session or virtual time.
 
@@ -84,18 +88,18 @@ def summarise_origin(log: Log) -> str:
 
 
 def describe_changes(scenario: Scenario) -> str:
-    """Returns how a scenario differs from the shipped scenario of the same name and title.
+    """Returns how a scenario differs from the shipped scenario with the same name and title.
 
-    The title and the description of a scenario state its original settings. A run with other
-    settings, for example of `trilat rerun`, keeps title and description. The reader must
-    therefore be informed of the differences.
+    The title and description of a scenario refer to its original settings, but a run with other
+    settings, for example from `trilat rerun`, keeps them. The reader must therefore be told
+    about the differences.
 
     Args:
         scenario: Scenario of the run.
 
     Returns:
-        A phrase such as "every link: constant 800 ms instead of constant 400 ms". Empty if the
-        scenario has no such difference, or if no shipped scenario has its name.
+        A phrase such as "every link: constant 800 ms instead of constant 400 ms". Empty if
+        there are no such differences, or if no shipped scenario has this name.
     """
     if scenario.name not in list_shipped():
         return ""
@@ -104,7 +108,7 @@ def describe_changes(scenario: Scenario) -> str:
     if shipped.title != scenario.title:
         return ""
 
-    all_differences = compare_scenarios([shipped, scenario])
+    all_differences = ScenarioDifference.list_between([shipped, scenario])
     differences = [entry for entry in all_differences if entry.key not in _STATED_KEYS]
     phrases = []
     for difference in differences[:_MAX_CHANGES]:
@@ -117,21 +121,21 @@ def describe_changes(scenario: Scenario) -> str:
 
 
 def _render_description(scenario: Scenario) -> Markup:
-    """Returns the description of a scenario as paragraphs, with text in backticks as code."""
+    """Renders a scenario's description as paragraphs, with text in backticks as code."""
     paragraphs = [text for text in scenario.about.strip().split("\n\n") if text]
     return render_macro("origin.html", "description", paragraphs=paragraphs)
 
 
 def _render_assumptions(scenario: Scenario) -> Markup:
-    """Returns the list of assumptions that the scenario declares, and the notes on its arms."""
+    """Renders the list of assumptions declared by the scenario, and the notes on its arms."""
     texts = [*scenario.assumed, *list_arm_notes(scenario)]
     return render_macro("origin.html", "assumptions", texts=texts)
 
 
 def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:
-    """Returns the facts about a recording for a table, such as its length and missing records.
+    """Returns facts about a recording, such as its length and missing records, for a table.
 
-    Each fact is a heading and a text.
+    Each fact is a pair of heading and text.
     """
     scenario = log.scenario
     records = f"{facts['records']}, {facts['missing']} missing"
@@ -152,7 +156,7 @@ def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:
 def _describe_driver(log: Log) -> str:
     """Returns a text on how a run was executed: simulated, repeated from a log, or live.
 
-    The text on a live session contains the time of its start ("epoch").
+    For a live session, the text includes its start time ("epoch").
     """
     session = log.session
     if log.driver == "virtual":
@@ -169,10 +173,10 @@ def _describe_driver(log: Log) -> str:
 
 
 def _find_scenario_argument(scenario: Scenario) -> tuple[str, str]:
-    """Returns how a command names the scenario, and where the scenario comes from.
+    """Returns how a command refers to the scenario, and where the scenario comes from.
 
-    If the scenario is shipped with this program, its name is enough. Otherwise a command saves
-    the text of the scenario as a file first.
+    The name is enough for a scenario shipped with this program. For any other, a command first
+    saves the text of the scenario to a file.
     """
     has_shipped_name = scenario.name in list_shipped()
     if has_shipped_name and load_scenario(scenario.name).sha256 == scenario.sha256:
@@ -181,7 +185,7 @@ def _find_scenario_argument(scenario: Scenario) -> tuple[str, str]:
 
 
 def _list_commands(log: Log, scenario: str) -> str:
-    """Returns the shell commands with which a reader can check and repeat the run.
+    """Returns the shell commands that check and repeat the run.
 
     Args:
         log: Log of the run.
@@ -203,12 +207,13 @@ def _list_commands(log: Log, scenario: str) -> str:
 
 
 def _list_law_files(scenario: Scenario) -> list[str]:
-    """Returns the files of the user-written control laws, relative to the folder of imports.
+    """Returns the files of the user-written control laws, relative to the import folder.
 
-    A log names the module of a law, such as "mine.laws", and not the folder of its file.
+    A log contains the module name of a law, such as "mine.laws", but not the folder of its
+    file.
     """
     files = []
-    for law in find_user_laws(scenario):
+    for law in scenario.inspect_user_laws():
         module, _, _ = law.code.partition(":")
         files.append(f"{module.replace('.', '/')}.py")
     return list(dict.fromkeys(files))
@@ -217,8 +222,7 @@ def _list_law_files(scenario: Scenario) -> list[str]:
 def _list_versions(log: Log) -> list[tuple[str, str]]:
     """Returns the software and the machine that recorded a log, as pairs of name and text.
 
-    The fingerprint of the arithmetic shows whether another machine computes the same last
-    digits.
+    The arithmetic fingerprint shows whether another machine computes bit-identical results.
     """
     session = log.session
     commit = session.get("commit", "unknown")
@@ -237,3 +241,14 @@ def _list_versions(log: Log) -> list[tuple[str, str]]:
         if key.startswith(prefix):
             entries.append((key.removeprefix(prefix), version))
     return entries
+
+
+def _render_code(text: str) -> Markup:
+    """Renders commands or the contents of a file as HTML in a monospaced font.
+
+    Line breaks are preserved.
+
+    Args:
+        text: The commands or the contents, as plain text.
+    """
+    return render_macro("parts.html", "code", text=text)

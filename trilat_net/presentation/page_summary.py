@@ -1,14 +1,14 @@
-"""Renders the first lines of a report: the stability judgement, its checks and key numbers.
+"""Renders the top lines of a report: the stability verdict, its checks and key figures.
 
 These lines let a reader decide within seconds whether the run needs a closer look. One of the
-key numbers is the tracking error e, the difference between the motion of an arm and the motion
-that it should follow.
+key figures is the tracking error e, the difference between the motion of an arm and its
+reference.
 
 Invariant:
-    - If a number seems to contradict the judgement, a sentence names this number and explains
-      why both are true.
-    - A failed check is named in the first lines, and its details are unfolded.
-    - Every text that comes from a log is escaped, by the template `summary.html`.
+    - If a number seems to contradict the verdict, a sentence names the number and explains why
+      both are true.
+    - A failed check is named in the top lines, and its details are expanded.
+    - Every string that comes from a log is escaped by the template `summary.html`.
 """
 
 from collections.abc import Sequence
@@ -23,10 +23,9 @@ from ..analysis import (
     Certificate,
     EndBehaviour,
     JointError,
-    RunView,
+    LogMetrics,
     Stability,
     Timeline,
-    measure_undelayed_error,
 )
 from ..errors import count_nouns, join_words
 from ..log import Finding, Log
@@ -39,22 +38,21 @@ from .plot_signals import shared_unit
 from .style import typeset
 
 _MAX_ALARMS = 8
-"""Largest number of alarms at the top of the page."""
+"""Maximum number of alarms at the top of the page."""
 _SEVERE_ALARMS = ("FAULT", "STOPPED")
-"""Names of the alarms of sites that can no longer move."""
+"""Names of alarms after which a site can no longer move."""
 
 _MEANINGS = {
     Stability.STABLE: "A proof holds for this loop, and the run agrees with it",
     Stability.NOT_STABLE: "The motion of this run does not come to rest",
     Stability.OPEN: "Nothing decides whether this loop is stable",
 }
-"""Meaning of each judgement. The meaning of a settled run contains values, see `_explain_word`.
-"""
+"""Explanation of each verdict. For a settled run it contains values, see `_explain_word`."""
 _ROOTS_AND_THEOREM = (
     "This proof is about small motions near the final pose. The paper's theorem, which "
     "is examined below, is another proof, and this one does not need it."
 )
-"""Explanation for readers if the loop has stable roots, but not all premises of the theorem
+"""Explanation for readers if the loop has stable roots although not all premises of the theorem
 hold.
 """
 _MARKS = {
@@ -63,7 +61,7 @@ _MARKS = {
     Stability.NOT_STABLE: "bad",
     Stability.OPEN: "warn",
 }
-"""Style of each judgement."""
+"""Style of each verdict."""
 _ENDS = {
     EndBehaviour.DECAYS: "the motion was dying away",
     EndBehaviour.HARDLY: "the motion was hardly dying away",
@@ -83,12 +81,12 @@ The clause about a run that converged contains values, see `_explain_end`.
 def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
     """Renders the verdict on whether a run was stable, with the evidence for it.
 
-    The page of a run begins with this verdict.
+    The verdict is at the top of the page of a run.
 
     Args:
         log: Log of the run.
-        certificate: The judgement, with its reasons.
-        findings: Results of the checks of the log. The judgement is in doubt if one failed.
+        certificate: Stability certificate of the run.
+        findings: Results of the log checks. If any failed, the verdict is in doubt.
     """
     if log.why_empty:
         return render_macro(
@@ -122,16 +120,16 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
         "verdict",
         css_class=css_class,
         word=word.capitalize(),
-        basis=typeset(describe_basis(certificate)),
+        basis=typeset(_describe_basis(certificate)),
         explanation=" ".join(sentences),
         remarks=" ".join(remarks),
     )
 
 
 def _start_sentence(text: str) -> str:
-    """Capitalises a clause, so that it can begin a sentence.
+    """Capitalises a clause for use at the start of a sentence.
 
-    Names of arms such as "m1", which are written as they are, keep their first letter.
+    Names of arms such as "m1" are case-sensitive and keep their first letter.
 
     Args:
         text: The clause.
@@ -141,14 +139,14 @@ def _start_sentence(text: str) -> str:
     return text if is_name and first_word != "a" else f"{text[:1].upper()}{text[1:]}"
 
 
-def describe_basis(certificate: Certificate) -> str:
-    """Returns a sentence on the meaning and the basis of a judgement about stability.
+def _describe_basis(certificate: Certificate) -> str:
+    """Returns a sentence on the meaning and the basis of a stability verdict.
 
-    A simulation and a live session, or a proof and an observation, support a judgement to
-    different degrees.
+    How strongly a verdict is supported depends on whether the run was simulated or live, and on
+    whether stability was proved or observed.
 
     Args:
-        certificate: The judgement, with its reasons.
+        certificate: Stability certificate of the run.
     """
     decision = certificate.decision
     if certificate.end.behaviour is EndBehaviour.DIVERGED:
@@ -162,7 +160,7 @@ def describe_basis(certificate: Certificate) -> str:
     if decision.stability is not Stability.OPEN:
         return f"{meaning} – {decision.rests_on}."
 
-    # The judgement is open. The first reason is stated, and the others are counted.
+    # The verdict is open. The first reason is stated, and the others are counted.
     reason, *other_reasons = [text for text in (decision.rests_on, *decision.reasons) if text]
     count_text = (
         f" ({count_nouns(len(other_reasons), 'more reason')} below)" if other_reasons else ""
@@ -171,18 +169,18 @@ def describe_basis(certificate: Certificate) -> str:
 
 
 def _explain_word(certificate: Certificate) -> str:
-    """Returns the meaning of the judgement of a run as a clause."""
+    """Returns the meaning of the verdict on a run as a clause."""
     if certificate.stability is Stability.SETTLED:
         return _start_sentence(describe_settling(certificate))
     return _MEANINGS[certificate.stability]
 
 
 def _explain_end(log: Log, certificate: Certificate) -> str:
-    """Returns sentences on the end of the motion, and why it does not contradict the judgement.
+    """Returns sentences on the end of the motion, and why it does not contradict the verdict.
 
-    The judgement is about the loop: whether disturbances of its motion die away. A stable run
-    may end with remaining errors, for example because an operator still pushes. Without an
-    explanation, a reader might think that the judgement is wrong.
+    The verdict is about the loop: whether disturbances of its motion die away. A stable run may
+    still end with remaining errors, for example because an operator keeps pushing. Without an
+    explanation, a reader might think that the verdict is wrong.
     """
     end = certificate.end
     if end.missing_sites:
@@ -208,7 +206,7 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     if end.behaviour is EndBehaviour.DIVERGED:
         text = f"The record ends soon after {clause}."
 
-    # Why the end and the judgement are both true.
+    # Why the end does not contradict the verdict.
     if is_stable and end.stability is Stability.NOT_STABLE:
         return f"{text} The proof and the pushes show that such motion dies away."
     if is_stable and error_remains:
@@ -223,7 +221,10 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
 
 
 def _explain_remaining_error(log: Log) -> str:
-    """Returns a clause on the sites that hands or walls still push at the end. May be empty."""
+    """Returns a clause on the sites that operators or walls still push at the end.
+
+    Empty if there are none.
+    """
     pushed = _list_pushed_sites(log)
     if not pushed:
         return ""
@@ -231,7 +232,7 @@ def _explain_remaining_error(log: Log) -> str:
 
 
 def _list_pushed_sites(log: Log) -> list[str]:
-    """Lists the sites that hands or walls still push in the last record."""
+    """Lists the sites that are still pushed by operators or walls in the last record."""
     pushed = []
     for site in log.sites:
         records = log[site]
@@ -241,12 +242,12 @@ def _list_pushed_sites(log: Log) -> list[str]:
 
 
 class _KeyNumber(NamedTuple):
-    """One of the most important numbers of a run, which a report shows at its top.
+    """One of the most important figures of a run, shown at the top of a report.
 
     Attributes:
         name: Name of the quantity.
         value: The number with its unit.
-        detail: Place and time of the measurement, or the contents of the number.
+        detail: Where and when the number was measured, or what it includes.
     """
 
     name: str
@@ -255,13 +256,13 @@ class _KeyNumber(NamedTuple):
 
 
 def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
-    """Renders the most important numbers of a run: its errors and the delay in use.
+    """Renders the most important figures of a run: its errors and the delay in use.
 
-    The key numbers are shown below the judgement, for readers who read nothing else.
+    They are shown below the verdict, for readers who read nothing else.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
     """
     numbers = [
         *_list_error_cards(log),
@@ -281,7 +282,7 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
         sites: Names of the sites to consider. Empty for all sites.
 
     Returns:
-        The first record with this error. `None` if no record has a finite error.
+        The earliest occurrence of the largest error. `None` if no record has a finite error.
     """
     peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
     known_peaks = [peak for peak in peaks if peak is not None]
@@ -289,11 +290,10 @@ def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
 
 
 def _list_error_cards(log: Log) -> list[_KeyNumber]:
-    """Returns the key numbers about errors, for the slaves and then for the masters.
+    """Returns the key figures about errors, for the slaves and then for the masters.
 
-    A slave is a remote arm, and a master is an arm that a person moves. The error of a slave
-    says how well it follows the people. The error of a master is large while its operator leads
-    the others, and says nothing about how well the other arms follow.
+    The error of a slave shows how well it follows the people. The error of a master is large
+    while its operator leads the others, and does not show how well the other arms follow.
     """
     slaves = [site for site in log.sites if log.scenario.sites[site].role == "slave"]
     masters = [site for site in log.sites if site not in slaves]
@@ -307,15 +307,14 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
 
 
 def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
-    """Returns a text with the largest error of some arms, and that of the last second.
+    """Returns the largest error of some arms, together with that of the last second.
 
-    The error e is the difference between the angles of an arm and the angles that it should
-    have.
+    The error e is the difference between the actual and the desired angles of an arm.
 
     Args:
         log: Log of the run.
         sites: Names of the sites.
-        place: Phrase for the pose from which the error is measured, which ends the name of the
+        place: Phrase for the pose from which the error is measured, appended to the name of the
             number.
     """
     peak = find_error_peak(log, sites)
@@ -338,35 +337,30 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
 
 
 def _describe_undelayed_error(log: Log, slaves: Sequence[str]) -> list[_KeyNumber]:
-    """Returns a text on how far the slave arms were from the others at the same time.
+    """Returns how far the slave arms were from the other arms at the same time.
 
     The tracking error compares a slave with states that the other arms sent some time ago. A
-    reader who sees the arms apart on the screen looks for the distance at the same time.
+    reader who sees the arms apart on the screen is interested in the distance at the same time.
 
     Args:
         log: Log of the run.
         slaves: Names of the slaves.
 
     Returns:
-        The number in a list. Empty if the distance is unknown.
+        A list with the number. Empty if the distance is unknown.
     """
-    run_view = RunView(log)
-    unit = "rad" if shared_unit(log) == "rad" else "m"
-    distances = []
-    for slave in slaves:
-        metrics = measure_undelayed_error(run_view, slave)
-        distances.append(metrics[f"undelayed_max_{unit}"].value)
-    known_distances = [distance for distance in distances if distance is not None]
-    if not known_distances:
+    distances = LogMetrics.find_undelayed_maxima(log, slaves)
+    if not distances:
         return []
 
+    unit = "rad" if shared_unit(log) == "rad" else "m"
     name = f"{join_words(slaves)} from where the masters are"
-    value = f"{max(known_distances):.3g} {unit}"
+    value = f"{max(distances.values()):.3g} {unit}"
     return [_KeyNumber(name, value, "largest at the same moment, delay included")]
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
-    """Returns the time from which all errors stay below the limit of the settling time."""
+    """Returns the time from which all errors stay below the settling limit."""
     name = f"All errors below {facts['settle_below_rad']:g} {shared_unit(log)}"
     if facts["max_error_end_rad"] is None:
         return _KeyNumber(name, NO_NUMBER, "no record")
@@ -378,9 +372,9 @@ def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
 
 
 def _describe_delay(facts: JsonObject) -> _KeyNumber:
-    """Returns a text on the mean age and the range of ages of the states that were used.
+    """Returns the mean and the range of the ages of the samples that were used.
 
-    The age of another arm's state is the delay that a controller experiences.
+    The age of another arm's sample is the delay that a controller experiences.
     """
     ages_ms = [link["age_ms"] for link in facts["links"].values()]
     means_ms = [age["mean"] for age in ages_ms if age["mean"] is not None]
@@ -399,11 +393,11 @@ def _describe_delay(facts: JsonObject) -> _KeyNumber:
 
 
 def render_alarms(log: Log) -> Markup:
-    """Renders the alarms of a run, such as an emergency stop, as a list in large type.
+    """Renders the alarms of a run, such as an emergency stop, as a list in large print.
 
-    Faults and stops are the severe alarms. If there are severe alarms, only these are listed,
-    because other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and
-    the number of the others is stated.
+    If there are severe alarms (faults and stops), only these are listed, because other alarms
+    usually follow from them. The list shows at most `_MAX_ALARMS` alarms and the number of
+    remaining ones.
 
     Args:
         log: Log of the run.
@@ -429,14 +423,14 @@ def render_alarms(log: Log) -> Markup:
 
 
 def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
-    """Renders the results of the checks of the log as one line, which unfolds into a list.
+    """Renders the results of the log checks as one line, which expands into a list.
 
-    The list is unfolded at first if a check has failed.
+    The list is expanded initially if a check has failed.
 
     Args:
         findings: Results of the checks. Some may be undecided, for example because the code of
-            a user's control law may not run here.
-        facts: Numbers of the run, from `summarise_run`.
+            a user's control law is not allowed to run here.
+        facts: Key figures of the run, from `summarise_run`.
 
     Returns:
         HTML of the line. Empty if nothing was checked.
@@ -460,7 +454,7 @@ def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
 
 
 def _summarise_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
-    """Returns a sentence about the checks of a log if all of them passed.
+    """Returns a sentence about the log checks if all of them passed.
 
     For example: "All records present; executed again bit for bit; 3 other checks passed." A
     result with a remark, such as ticks that a site did not execute, is quoted in full.

@@ -1,13 +1,13 @@
-"""Renders the section of a report that lists the events of the run, in order of time.
+"""Renders the section of a report that lists the events of the run, in chronological order.
 
 For example, a command changed the network delay at 5 s, or an operator pushed an arm at 7 s.
-The section also lists alarms, and changes of an arm's mode: it follows the other arms, holds
-its position, brakes or returns.
+The section also lists alarms and the mode changes of each arm, such as holding its position,
+braking or returning.
 
 Invariant:
-    - Every sentence comes from the scenario or from a record.
+    - Every sentence is based on the scenario or on a record.
     - Changes have the same numbers as their marks in the charts.
-    - Moments beyond `MAX_SHOWN` are folded, and moments beyond `_MAX_MOMENTS` are left out.
+    - Moments beyond `MAX_SHOWN` are collapsed, and moments beyond `_MAX_MOMENTS` are omitted.
 """
 
 from collections.abc import Iterator
@@ -29,17 +29,17 @@ from .plot_signals import shared_unit, sites_with_operator
 from .style import typeset
 
 MAX_SHOWN = 5
-"""Largest number of moments that are not folded."""
+"""Maximum number of moments that are not collapsed."""
 _MAX_MOMENTS = 400
-"""Largest number of moments on the page. summary.json has all modes and changes."""
+"""Maximum number of moments on the page. summary.json has all modes and changes."""
 _MAX_PUSHES = 3
-"""Largest number of pushes of a site that have separate sentences. More pushes share a
-sentence.
+"""Maximum number of pushes of a site described in separate sentences. If there are more, they
+share a sentence.
 """
 _PAUSE_S = 0.2
-"""Shortest pause between two pushes, in s. Shorter pauses do not divide a push."""
+"""Minimum pause that separates two pushes, in s."""
 _LEAST_PUSH_NM = 1e-3
-"""Torque, in N m, below which an arm does not count as pushed."""
+"""Minimum torque for an arm to count as pushed, in N m."""
 _DID = {
     "hold": "held still",
     "brake": "braked",
@@ -48,19 +48,19 @@ _DID = {
     "fault": "stood still with a fault",
     "stopped": "stood by order",
 }
-"""Clause on the behaviour of a site in each mode. Other modes are described by their names in
-the records.
+"""Clause that describes the behaviour of a site in each mode. Other modes are described by
+their names in the records.
 """
 
 
 class _RunMoment(NamedTuple):
-    """An event in a run at a certain time, such as a changed delay or an alarm.
+    """An event at a certain time in a run, such as a changed delay or an alarm.
 
     Attributes:
         t_s: Time at which the event happened or began, in s.
         sentence: Sentence about the event.
-        site: Name of the site concerned. Empty if the event concerns all sites.
-        number: Number of the change, which charts show. `None` for other events.
+        site: Name of the site affected. Empty if the event affects all sites.
+        number: Number of the change, as shown in charts. `None` for other events.
         is_bad: True for alarms and divergence.
     """
 
@@ -72,14 +72,14 @@ class _RunMoment(NamedTuple):
 
 
 def render_timeline(log: Log, facts: JsonObject) -> Markup:
-    """Renders the section with the events of the run, in the order of time.
+    """Renders the section with the events of the run, in chronological order.
 
     Examples are a changed delay, a push by an operator, and an arm that stopped because the
     network was interrupted.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
     """
     moments = list_moments(log, facts)
     body = _render_moments(log, moments[:MAX_SHOWN])
@@ -95,7 +95,7 @@ def render_timeline(log: Log, facts: JsonObject) -> Markup:
 
 
 def _render_moments(log: Log, moments: list[_RunMoment]) -> Markup:
-    """Returns moments as a list with a time, a number and a sentence each."""
+    """Renders moments as a list, each with its time, number and sentence."""
     rows = []
     for moment in moments:
         row = moment._asdict()
@@ -106,13 +106,13 @@ def _render_moments(log: Log, moments: list[_RunMoment]) -> Markup:
 
 
 def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
-    """Lists the events of a run in the order of time: changes, pushes, modes and errors.
+    """Lists the events of a run in chronological order: changes, pushes, modes and errors.
 
-    The page of the run lists the events, so that a reader can relate the curves to them.
+    The list lets readers of the page relate the curves to the events.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run, from `summarise_run`.
+        facts: Key figures of the run, from `summarise_run`.
     """
     moments = [
         _RunMoment(0.0, f"The run starts; {describe_dominance(log.scenario)}."),
@@ -127,10 +127,9 @@ def list_moments(log: Log, facts: JsonObject) -> list[_RunMoment]:
 
 
 def describe_dominance(scenario: Scenario) -> str:
-    """Returns the peers that each site follows at the start, as in "m1 follows s 0.7, m2 0.3".
+    """Returns which peers each site follows initially, as in "m1 follows s 0.7, m2 0.3".
 
-    A peer is another site whose states the site receives. The number is the dominance factor,
-    the weight with which the site follows the peer. Peers with the factor 0 are left out.
+    The numbers are the dominance factors. Peers with a factor of 0 are omitted.
 
     Args:
         scenario: Scenario of the run.
@@ -143,7 +142,7 @@ def describe_dominance(scenario: Scenario) -> str:
 
 
 def _list_hands(log: Log) -> Iterator[_RunMoment]:
-    """Yields the moments at which people and programs took or released arms, or failed."""
+    """Yields the moments at which people and programs took over or released arms, or failed."""
     failures = log.failed_hands
     for event in log.events:
         if event.kind == "hand":
@@ -156,13 +155,13 @@ def _list_hands(log: Log) -> Iterator[_RunMoment]:
 
 
 def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
-    """Yields the changes of settings during a run, such as another delay, for the timeline.
+    """Yields the setting changes during a run, such as a new delay, for the timeline.
 
     Charts mark the changes with the same numbers.
 
     Args:
         log: Log of the run.
-        facts: Numbers of the run.
+        facts: Key figures of the run, from `summarise_run`.
     """
     for number, change in enumerate(facts["changes"], 1):
         tick = change["taken_at_tick"]
@@ -183,7 +182,7 @@ def _list_changes(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
 def _list_pushes(log: Log) -> Iterator[_RunMoment]:
     """Yields the moments at which operators, walls or bodies pushed an arm, with the torque.
 
-    Short pauses do not divide a push. If an arm was pushed very often, a single moment states
+    Short pauses do not separate pushes. If an arm was pushed very often, a single moment states
     the number of pushes.
     """
     for site in sites_with_operator(log):
@@ -212,14 +211,14 @@ def _list_pushes(log: Log) -> Iterator[_RunMoment]:
 
 
 def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
-    """Returns the intervals of time in which a condition holds, as start and end in s.
+    """Returns the time intervals in which a condition holds, as start and end in s.
 
-    An example of a condition is that an operator pushes. Interruptions that are shorter than
-    `_PAUSE_S` do not divide an interval.
+    The condition could be, for example, that an operator pushes. Interruptions shorter than
+    `_PAUSE_S` do not split an interval.
 
     Args:
         t_s: Times of K records, shape (K,).
-        acts: True for the records at which the condition holds, shape (K,).
+        acts: True for records at which the condition holds, shape (K,).
     """
     times_s = t_s[acts]
     if not len(times_s):
@@ -243,9 +242,9 @@ def _name_pusher(log: Log, site: str) -> str:
 
 
 def _list_modes(log: Log) -> Iterator[_RunMoment]:
-    """Yields the moments at which an arm stopped following, to hold, brake or return.
+    """Yields the moments at which an arm stopped following in order to hold, brake or return.
 
-    The sentence contains the reason if there was an alarm. Arms that did the same at the same
+    If there was an alarm, the sentence states the reason. Arms that did the same at the same
     time share a sentence.
     """
     timeline = Timeline(log)
@@ -272,7 +271,7 @@ def _list_modes(log: Log) -> Iterator[_RunMoment]:
 
 
 def _list_errors(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
-    """Yields the moments at which the tracking error was largest, became small, or diverged.
+    """Yields the moments at which the tracking error peaked, became small, or diverged.
 
     The tracking error is the difference between the actual and the desired joint angles.
     """

@@ -1,14 +1,13 @@
-"""Defines the signals that only figures and pages show, and reduces signals for plots.
+"""Defines the signals that only figures and pages show, and decimates signals for plots.
 
-A signal is an array with one row for each period of the control loop. A run of a minute at 1
-kHz has 60 000 rows, too many for a plot. Therefore the rows are reduced: each bucket of records
-keeps the minimum and the maximum of each column, so that a spike of a single period remains
-visible. A gap in the records that is wider than a bucket becomes a row of NaN, so that no line
-is drawn across it. `analysis.site_signals` contains the signals that metrics and summaries also
-use.
+A signal is an array with one row per tick. A one-minute run at 1 kHz has 60 000 rows, too many
+for a plot, so the rows are decimated: each bucket of records keeps the minimum and the maximum
+of each column, so that even a spike of a single tick remains visible. A gap in the records that
+is wider than a bucket becomes a row of NaN, which interrupts the plotted line. Signals that
+metrics and summaries also use are in `analysis.site_signals`.
 
 Invariant:
-    - Empty logs give empty arrays.
+    - Empty logs result in empty arrays.
 """
 
 from typing import NamedTuple
@@ -20,11 +19,11 @@ from ..log import Ints, Log, SiteLog
 
 
 def reference_angles(part: SiteLog) -> Array:
-    """Returns the angles that the joints of an arm should reach, in rad.
+    """Returns the reference angles of an arm's joints, in rad.
 
     The reference q_des, Eq. (6), is the weighted mean of the delayed angles of the other arms.
-    If the arms follow each other's end effectors (task space), the joints have no reference,
-    and the angles q themselves are returned.
+    If the arms follow each other's end effectors (task space), there are no joint references,
+    and the actual angles q are returned.
 
     Args:
         part: Records of the arm.
@@ -42,8 +41,8 @@ def joint_error_rates(part: SiteLog) -> Array:
         part: The K records of the arm.
 
     Returns:
-        Velocity errors of the n joints, shape (K, n), in rad/s. If the arm follows with its end
-        effector, they are the errors of its m coordinates, shape (K, m).
+        Velocity errors of the n joints, in rad/s, shape (K, n). If the arms follow each other's
+        end effectors, the velocity errors of the m task coordinates, shape (K, m).
     """
     if part.layout.task:
         # in task space the column qd_des holds xd_des
@@ -55,10 +54,10 @@ def joint_error_rates(part: SiteLog) -> Array:
 
 
 def shared_unit(log: Log) -> str:
-    """Returns the unit of the coordinates with which the arms follow each other.
+    """Returns the unit of the coordinates in which the arms follow each other.
 
-    It is "rad" for joint angles, "m" for positions and "m, rad" for poses of end effectors.
-    Errors have the same unit.
+    This is "rad" for joint angles, "m" for end effector positions, and "m, rad" for end
+    effector poses. Errors have the same unit.
 
     Args:
         log: The log of the run.
@@ -71,17 +70,17 @@ def shared_unit(log: Log) -> str:
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns the age of the other arms' states that a control loop used, in ms.
+    """Returns the ages of the peer samples that a site used in each tick, in ms.
 
-    In each control period, the loop uses the newest message of each other arm. Its age is the
-    delay that the loop experiences.
+    A site uses the newest sample from each peer. Its age is the delay that the control loop
+    experiences.
 
     Args:
         log: The log of the run.
         site: Name of the site.
 
     Returns:
-        Ages, shape (K, N - 1), with a column for each peer. NaN before a peer's first sample.
+        Ages, shape (K, N - 1), with one column per peer. NaN before the first sample of a peer.
     """
     records = log[site]
     columns = []
@@ -94,9 +93,9 @@ def sample_ages_ms(log: Log, site: str) -> Array:
 
 
 def sites_with_operator(log: Log) -> list[str]:
-    """Returns the arms on which a person or program may act.
+    """Returns the sites at which a person or program may act on the arm.
 
-    These arms have an operator in the scenario, or recorded external torques.
+    These sites have an operator in the scenario, or recorded external torques.
 
     Args:
         log: The log of the run.
@@ -111,14 +110,14 @@ def sites_with_operator(log: Log) -> list[str]:
 
 
 class _DecimatedTrace(NamedTuple):
-    """Signals reduced to few points, so that they can be drawn quickly.
+    """Signals decimated to a few points, for fast drawing.
 
     A gap in the records that would be visible is marked by a row of NaN, which interrupts the
     curve.
 
     Attributes:
         tick: Ticks of the P points, shape (P,).
-        t_s: Times of the points, shape (P,), in s.
+        t_s: Times of the points, in s, shape (P,).
         values: Values of the C signals, shape (P, C).
     """
 
@@ -128,19 +127,19 @@ class _DecimatedTrace(NamedTuple):
 
 
 def extreme_rows(values: Array, buckets: int) -> Ints:
-    """Chooses the rows of some signals that a plot needs, so that no peak is lost.
+    """Selects the rows of a set of signals that a plot needs in order to show every peak.
 
-    The rows are divided into buckets, intervals with equal numbers of rows. In each bucket the
-    rows with the largest and the smallest value of each column are kept. The first and the last
-    row are kept as well. NaN is never an extreme. A bucket in which a column is NaN throughout
-    keeps its first row.
+    The rows are divided into buckets with equal numbers of rows. Each bucket keeps the rows
+    with the largest and smallest value of each column. The first and the last row are always
+    kept. NaN is never an extreme. A bucket in which a column is entirely NaN keeps its first
+    row.
 
     Args:
         values: The signals in columns, shape (K, C).
         buckets: Number of buckets.
 
     Returns:
-        Indices of the rows.
+        Indices of the selected rows.
     """
     row_count, column_count = values.shape
     if row_count <= 2 * buckets or not column_count:
@@ -175,14 +174,14 @@ def decimate(
     values: Array,
     buckets: int,
 ) -> _DecimatedTrace:
-    """Reduces signals to the points that a plot needs, so that no peak is lost.
+    """Decimates signals to the points that a plot needs in order to show every peak.
 
-    The time is divided into buckets. Each bucket keeps at most 2 C + 3 points for C columns,
-    including the extremes of each column. One bucket per pixel of a plot is enough.
+    The time axis is divided into buckets. For C columns, each bucket keeps at most 2 C + 3
+    points, including the extremes of each column. One bucket per pixel of the plot is enough.
 
     Args:
-        tick: Ascending ticks, shape (K,).
-        t_s: Their nominal times, shape (K,), in s.
+        tick: Ticks in ascending order, shape (K,).
+        t_s: Nominal times of the ticks, in s, shape (K,).
         values: The signals in columns, shape (K, C).
         buckets: Number of buckets.
     """

@@ -1,7 +1,7 @@
-"""Writes the remarks on a run that matter to readers of its stability judgement.
+"""Describes circumstances of a run that readers of its stability verdict should know about.
 
-`analysis.run_remarks` finds the circumstances. For example, this module writes "m1 and m2 were
-at their torque limit for 0.56 s and 0.43 s".
+`analysis.run_remarks` finds these circumstances. This module writes, for example, "m1 and m2
+were at their torque limit for 0.56 s and 0.43 s".
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -12,7 +12,7 @@ from ..errors import count_nouns, join_words
 
 
 def _list_remarks(run: run_remarks.RunCircumstances) -> Iterator[str]:
-    """Yields a sentence without a full stop for each circumstance that occurred."""
+    """Yields one sentence, without a full stop, for each circumstance that occurred."""
     if run.at_limit_s:
         verb = "was at its" if len(run.at_limit_s) == 1 else "were at their"
         durations = [f"{time_s:.3g} s" for time_s in run.at_limit_s.values()]
@@ -55,4 +55,5 @@ def _list_remarks(run: run_remarks.RunCircumstances) -> Iterator[str]:
 SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
     run_remarks.RunCircumstances: _list_remarks
 }
-"""The function that lists the remarks on a run, by the class of the circumstances."""
+"""Function that lists the remarks on a run, keyed by the class that contains its circumstances.
+"""

@@ -1,16 +1,16 @@
-"""Shows a log in the Rerun viewer, an interactive program for plots and 3D scenes.
+"""Shows a log in Rerun, an interactive viewer for plots and 3D scenes.
 
-Rerun reads the data of a log from its MCAP file, in channels with standard messages of ROS 2,
-and reads the layout of its views from another file, the "blueprint". `open_rerun` prepares both
-files and starts Rerun. The layout consists of pages of plots, with a column per arm and a row
-per quantity. The extra `view` of the package installs Rerun.
+Rerun reads the data of a log from its MCAP file, from channels with standard ROS 2 messages,
+and the layout of its views from another file, the "blueprint". `open_rerun` prepares both files
+and starts Rerun. The layout consists of pages of plots, with one column per arm and one row per
+quantity. Rerun is installed by the extra `view` of this package.
 
 Invariant:
-    - A finished log that has standard channels is opened as it is. Any other log is first
-      exported as a ROS 2 bag into a temporary folder.
+    - A finished log with standard channels is opened as is. Any other log is first exported as
+      a ROS 2 bag to a temporary folder.
     - All curves of a plot have the same unit, and every curve has a name.
-    - Quantities that a log lacks take no space.
-    - This module sets all views, names and colors instead of the viewer, so that all logs look
+    - Quantities that are not in the log take up no space.
+    - All views, names and colours are set here rather than by the viewer, so that all logs look
       alike.
 """
 
@@ -44,16 +44,16 @@ from ..log.ros2 import (
 from .exports.ros2 import export_ros2
 
 RunCommand = Callable[[list[str], Mapping[str, str]], int]
-"""Function that runs a command with an environment, and returns the exit code."""
+"""Function that runs a command with the given environment and returns the exit code."""
 
 _PROGRAM = (sys.executable, "-m", "rerun")
 _LOOPBACK = "127.0.0.1"
 _QUIET_ENVIRONMENT = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
-"""Variables that turn telemetry off, unless the user's environment sets them otherwise."""
+"""Environment variables that turn off telemetry, unless the user has set them."""
 
 
 class ViewerOptions(NamedTuple):
-    """Options of the command that shows a log in the viewer Rerun.
+    """Options of the command that shows a log in Rerun.
 
     Attributes:
         full: True to show every record instead of the decimated standard channels.
@@ -68,7 +68,7 @@ class ViewerOptions(NamedTuple):
 
 
 def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
-    """Runs a command, and returns its exit code."""
+    """Runs a command and returns its exit code."""
     return subprocess.run(command, env=environment).returncode
 
 
@@ -79,7 +79,7 @@ def open_rerun(
     print_line: Callable[[str], None],
     run_command: RunCommand = _run_process,
 ) -> None:
-    """Shows a log in the viewer Rerun, and returns when the user closes the viewer.
+    """Shows a log in Rerun, and returns when the user closes the viewer.
 
     Args:
         paths: File of the log, or its parts.
@@ -91,7 +91,7 @@ def open_rerun(
     Raises:
         UsageError: Rerun is not installed, or there is no display.
         LogError: The log cannot be read.
-        RunFailed: Rerun ended with an error.
+        RunFailed: Rerun exited with an error.
     """
     import_extra("rerun", "view", "viewers")
     _require_display(options)
@@ -110,7 +110,7 @@ def open_rerun(
             named_path.symlink_to(path.resolve())
             path = named_path
 
-        layout = build_plot_layout(Ros2Topics.of_file(path))
+        layout = PlotLayout.of_channels(Ros2Topics.of_file(path))
         layout_path = Path(folder) / "layout.rbl"
         _save_blueprint(layout, path.stem, layout_path)
         environment = {**_QUIET_ENVIRONMENT, **os.environ}
@@ -121,9 +121,9 @@ def open_rerun(
 
 
 def _require_display(options: ViewerOptions) -> None:
-    """Checks that the machine has a display if the viewer Rerun would open a window.
+    """Raises UsageError if Rerun would open a window but the machine has no display.
 
-    Without a display, the viewer itself fails with an obscure message.
+    Without a display, Rerun itself fails with an obscure message.
 
     Raises:
         UsageError: There is no display.
@@ -138,9 +138,9 @@ def _require_display(options: ViewerOptions) -> None:
 
 
 def make_application_id(path: Path) -> str:
-    """Returns the name under which the viewer Rerun stores the layout of a log.
+    """Returns the name under which Rerun stores the layout of a log.
 
-    The name is that of the log, with only the characters that Rerun allows.
+    This is the name of the log, restricted to the characters that Rerun allows.
 
     Args:
         path: Path of the log.
@@ -152,7 +152,7 @@ def make_application_id(path: Path) -> str:
 def _list_commands(
     options: ViewerOptions, log: Path, layout: Path, print_line: Callable[[str], None]
 ) -> list[list[str]]:
-    """Returns the arguments of the calls of Rerun that show or save a log, in order.
+    """Returns the argument lists of the Rerun calls that show or save a log, in order.
 
     The viewer accepts connections from this machine only. If the log is shown in a browser, the
     address of the page is printed.
@@ -180,7 +180,7 @@ def _list_commands(
 
 
 def _list_save_commands(log: Path, layout: Path, output: Path) -> list[list[str]]:
-    """Returns the arguments of two calls of Rerun that write log and layout to one file."""
+    """Returns the argument lists of two Rerun calls that write log and layout to one file."""
     # Rerun's own `--save` of several files stops when the end of one file is reached, and drops
     # the rest of the others (measured with Rerun 0.41: up to the whole log).
     recording = str(layout.with_name("log.rrd"))
@@ -190,7 +190,7 @@ def _list_save_commands(log: Path, layout: Path, output: Path) -> list[list[str]
 
 
 def _find_free_port() -> int:
-    """Returns a TCP port of this machine that is free at present."""
+    """Returns a TCP port of this machine that is currently free."""
     with socket.socket() as probe:
         probe.bind((_LOOPBACK, 0))
         port: int = probe.getsockname()[1]
@@ -198,11 +198,11 @@ def _find_free_port() -> int:
 
 
 _SESSION_CHANNELS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
-"""Names (last parts of the topics) of the channels of a session, which belong to no site."""
+"""Names (last parts of the topics) of session channels, which do not belong to a site."""
 
 
 class _PlotCurves(NamedTuple):
-    """Curves of a plot in the viewer Rerun, which show the values of one channel.
+    """Curves of a Rerun plot, which show the values of one channel.
 
     A channel is a series of messages with a topic.
 
@@ -220,11 +220,11 @@ class _PlotCurves(NamedTuple):
 class CurvePlot(NamedTuple):
     """A plot of one quantity of one site over time, on a page of the viewer.
 
-    For example the joint angles of m1, with the actual and the desired curves.
+    An example is the plot of the joint angles of m1, with the actual and the desired curves.
 
     Attributes:
         title: Title of the plot, with its unit.
-        curves: Curves of each of its channels.
+        curves: Curves of each channel in the plot.
     """
 
     title: str
@@ -236,29 +236,62 @@ PlotPage = list[list[CurvePlot]]
 
 
 class PlotLayout(NamedTuple):
-    """Layout in which the viewer Rerun shows a log: pages, plots, and arms in space.
+    """Layout in which Rerun shows a log: pages, plots, and arms in space.
 
     Attributes:
-        pages: Rows of plots on each page, by the name of the page.
-        lines: Topic of the texts about events. Empty if the log has no such topic.
-        arms: True if the arms are shown in space.
+        pages: Mapping from the name of each page to its rows of plots.
+        lines: Topic of the event messages. Empty if the log has no such topic.
+        arms: True to show the arms in space.
     """
 
     pages: dict[str, PlotPage]
     lines: str
     arms: bool = False
 
+    @classmethod
+    def of_channels(cls, channels: Ros2Channels) -> "PlotLayout":
+        """Arranges the channels (series of messages) of a log as plots on pages of the viewer.
+
+        A page has one row of plots per quantity, with one plot per arm. Pages and rows without
+        any curves are omitted.
+
+        Args:
+            channels: Mapping from topic to standard channel. Topics of sites are
+                `<root>/<site>/<name>`; `<root>/log` is an example of a session topic.
+        """
+        session_topics = [
+            topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS
+        ]
+        # A dictionary instead of a set keeps the order of the sites.
+        site_roots: dict[str, None] = {}
+        for topic in channels:
+            if topic not in session_topics:
+                site_roots[topic.rpartition("/")[0]] = None
+
+        rows_by_page = {**_PAGES, "Sent by laws": _list_sent_rows(channels)}
+        pages = {}
+        for name, rows in rows_by_page.items():
+            plots_by_row = [_build_row(channels, list(site_roots), row) for row in rows]
+            page = [row_plots for row_plots in plots_by_row if row_plots]
+            if page:
+                pages[name] = page
+
+        line_topics = [topic for topic in session_topics if topic.endswith(f"/{LINES}")]
+        lines = line_topics[0] if line_topics else ""
+        has_arms = any(channel.kind == TRANSFORMS for channel in channels.values())
+        return cls(pages, lines, has_arms)
+
 
 class _PlotRow(NamedTuple):
-    """A row of plots on a page of the viewer Rerun: one quantity, with a plot for each arm.
+    """A row of plots on a page of the viewer: one quantity, with one plot per arm.
 
     Attributes:
         quantity: Name of the quantity.
         unit: Unit of the quantity. Empty for a dimensionless number.
-        sources: Channels of the quantity. A source consists of the name of a channel, which is
-            the last part of its topic, and a field. For joint states, the field is the name of
-            one of their lists. For estimates, it is a kind of inertial parameter, such as "m",
-            or empty for planar arms. For other channels it is empty.
+        sources: Channels of the quantity, each given as a channel name (the last part of its
+            topic) and a field. For joint states, the field is the name of one of their lists.
+            For estimates, it is a kind of inertial parameter, such as "m", or empty for planar
+            arms. For other channels it is empty.
     """
 
     quantity: str
@@ -305,40 +338,9 @@ _PAGES: dict[str, tuple[_PlotRow, ...]] = {
 }
 """The rows of each page."""
 _MAX_LEGEND_NAMES = 20
-"""Largest number of curves in a legend. The names of more curves appear under the pointer."""
-
-
-def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Arranges the channels (series of messages) of a log as plots on the pages of the viewer.
-
-    A page has a row of plots per quantity and a plot per arm. Pages and rows without any curve
-    are left out.
-
-    Args:
-        channels: Standard channels by topic. Topics of sites are `<root>/<site>/<name>`, those
-            of the session are `<root>/log` and others.
-    """
-    session_topics = [
-        topic for topic in channels if _get_channel_name(topic) in _SESSION_CHANNELS
-    ]
-    # A dictionary instead of a set keeps the order of the sites.
-    site_roots: dict[str, None] = {}
-    for topic in channels:
-        if topic not in session_topics:
-            site_roots[topic.rpartition("/")[0]] = None
-
-    rows_by_page = {**_PAGES, "Sent by laws": _list_sent_rows(channels)}
-    pages = {}
-    for name, rows in rows_by_page.items():
-        plots_by_row = [_build_row(channels, list(site_roots), row) for row in rows]
-        page = [row_plots for row_plots in plots_by_row if row_plots]
-        if page:
-            pages[name] = page
-
-    line_topics = [topic for topic in session_topics if topic.endswith(f"/{LINES}")]
-    lines = line_topics[0] if line_topics else ""
-    has_arms = any(channel.kind == TRANSFORMS for channel in channels.values())
-    return PlotLayout(pages, lines, has_arms)
+"""Maximum number of curves in a legend. If there are more, names are shown only under the
+pointer.
+"""
 
 
 def _get_channel_name(topic: str) -> str:
@@ -349,8 +351,8 @@ def _get_channel_name(topic: str) -> str:
 def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
     """Returns a row of plots for each quantity that control laws send to other arms.
 
-    The rows are in the order in which the laws declare the quantities. The metadata of a
-    channel contains the name and the unit of its quantity.
+    The rows are in the order in which the laws declare the quantities. The channel metadata
+    contain the name and unit of the quantity.
     """
     rows = {}
     for topic, channel in channels.items():
@@ -363,11 +365,11 @@ def _list_sent_rows(channels: Ros2Channels) -> tuple[_PlotRow, ...]:
 
 
 def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> list[CurvePlot]:
-    """Returns the plots of one quantity, such as the joint angles, one plot for each arm.
+    """Returns the plots of one quantity, such as the joint angles, one per arm.
 
     Args:
-        channels: Standard channels by topic.
-        roots: First parts of the sites' topics, up to the name of the channel.
+        channels: Mapping from topic to standard channel.
+        roots: Prefixes of the sites' topics, up to the channel name.
         row: The quantity, and the channels that contain it.
     """
     plots = []
@@ -390,11 +392,11 @@ def _build_row(channels: Ros2Channels, roots: Sequence[str], row: _PlotRow) -> l
 def _select_curves(channels: Ros2Channels, topic: str, field: str) -> _PlotCurves | None:
     """Returns the curves of a channel that belong to a quantity.
 
-    A channel is a series of messages with a list of numbers, such as the angles of all joints.
-    A plot may need only some of these numbers.
+    Messages of a channel contain a list of numbers, such as the angles of all joints, of which
+    a plot may need only some.
 
     Args:
-        channels: Standard channels by topic.
+        channels: Mapping from topic to standard channel.
         topic: Topic of the channel.
         field: Field of the channel, see `_PlotRow`.
 
@@ -422,8 +424,8 @@ def _select_curves(channels: Ros2Channels, topic: str, field: str) -> _PlotCurve
 def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> _PlotCurves | None:
     """Returns the curves of the estimates of one kind of inertial parameter.
 
-    An adaptive control law estimates the inertial parameters of the arm, such as masses and
-    inertias. A plot shows one kind, because the units differ.
+    Adaptive control laws estimate the inertial parameters of the arm, such as masses and
+    inertias. A plot shows a single kind, because units differ between kinds.
 
     Args:
         topic: Topic of the channel.
@@ -431,7 +433,7 @@ def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> _PlotCurve
         names: Names of all estimates, such as "upper.m" for the mass of the link "upper".
 
     Returns:
-        The curves. `None` if the channel has no estimate of this kind.
+        The curves. `None` if the channel has no estimates of this kind.
     """
     visible = []
     for name in names:
@@ -448,15 +450,15 @@ def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> _PlotC
     """Returns the curves of the positions, velocities or torques of joints.
 
     The messages of a channel contain the states of the joints, those of the reference that the
-    joints follow, or both. The reference has names with the suffix "_ref", or the topic
-    ".../reference". In the viewer, the curves of a reference always have the suffix, which
-    gives them a paler colour. If a channel contains both, the reference is shown only among the
-    positions.
+    joints follow, or both. References are recognised by the suffix "_ref" of their names, or by
+    the topic ".../reference". In the viewer, their curves always have the suffix, which gives
+    them a paler colour. If a channel contains both, the reference is shown only for positions.
 
     Args:
         topic: Topic of the channel.
         field: Name of the list: "position", "velocity" or "effort".
-        names: Names of all joints. If there are no names, the channel counts as a reference.
+        names: Names of all joints. If there are no names, the channel is treated as a
+            reference.
 
     Returns:
         The curves. `None` for the torques of a reference, which do not exist.
@@ -485,18 +487,18 @@ _COLORS = [
     (110, 110, 110),
 ]
 _PALE_COLORS = [(150, 190, 225), (245, 175, 120)]
-"""Colors of references, paler than those of the joints that follow them."""
+"""Colours of references, which are paler than those of the joints that follow them."""
 _TIMELINE = "message_publish_time"
 
 
 def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
-    """Writes the layout of a log for the viewer Rerun to a file, called a blueprint.
+    """Writes the layout of a log to a Rerun blueprint file.
 
-    The file tells the viewer which plots and views to arrange on the screen.
+    The blueprint tells the viewer which plots and views to arrange on the screen.
 
     Args:
         layout: The plots on each page, and the other views.
-        application: Rerun's name of the recordings to which the layout applies.
+        application: Rerun's name for the recordings to which the layout applies.
         path: The file to write.
 
     Raises:
@@ -531,7 +533,7 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
 
 
 def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
-    """Returns a plot for the viewer Rerun, in which each channel has its own colors.
+    """Returns a Rerun view of a plot, in which each channel has its own colours.
 
     A legend with too many names would cover the curves, and is hidden.
     """
@@ -553,11 +555,11 @@ def _make_plot_view(rrb: Any, plot: CurvePlot) -> Any:
 
 
 def _style_curves(curves: _PlotCurves, first_color: int) -> Any:
-    """Returns the names and colors of curves in a plot. References have pale colors.
+    """Returns the names and colours of the curves in a plot. References have pale colours.
 
     Args:
         curves: The curves.
-        first_color: Index of the color of the first curve. Further curves have the next colors.
+        first_color: Colour index of the first curve. Further curves use the next colours.
     """
     rr = import_extra("rerun", "view", "viewers")
     pale_palette = cycle(_PALE_COLORS)

@@ -1,15 +1,15 @@
 """Represents the text of a result as blocks, for the terminal, plain text and HTML.
 
-The text of a result consists of blocks. A block is a line, a line that begins with a mark such
-as a green "ok" (`MarkedText`), or a table (`TextTable`).
+A block is a line, a line that begins with a mark such as a green "ok" (`MarkedText`), or a
+table (`TextTable`).
 
-A class of results may have a method `blocks` that returns its blocks. For other classes, a
-function in this folder composes the blocks, and `_COMPOSERS` lists these functions by the name
-of the class. Those classes therefore do not depend on this folder.
+A result class may have a method `blocks` that returns its blocks. For other classes, a function
+in this folder composes the blocks; `_COMPOSERS` lists these functions by class name, so that
+the classes do not depend on this folder.
 
 Invariant:
     - Terminal, plain text and HTML have the same blocks in the same order.
-    - Every cell of a table is text. All three forms have the same cells in the same order.
+    - Every table cell is a string. All three forms have the same cells in the same order.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -35,22 +35,21 @@ _COLOURS = {
 }
 MARKS = {state: f"[{colour}]{state:<4}[/{colour}]" for state, colour in _COLOURS.items()}
 MARKS["note"] = "note"
-"""Marks in Rich's markup, by the state of a finding."""
+"""Marks in Rich markup, keyed by the state of a finding."""
 
 
 class TextTable(NamedTuple):
-    """A table of texts that can be printed, or rendered as Markdown or HTML.
+    """A table of strings that can be printed, or rendered as Markdown or HTML.
 
     Attributes:
         headers: Header of each column. If all are empty, the table has no header line.
-        rows: Cells of each row. A shorter row leaves its last cells empty. A row of a single
-            cell in a wider table is the heading of a group of rows.
-        align: A letter per column, "l" for texts and "r" for numbers. The last letter also
+        rows: Cells of each row. In a row that is too short, the last cells are empty. A row
+            with a single cell in a wider table is the heading of a group of rows.
+        align: One letter per column, "l" for text and "r" for numbers. The last letter also
             applies to all further columns.
         units: Unit of each column, which is appended to the header. Empty for a column without
             a unit. There may be fewer units than headers.
-        styles: Styles of cells on a terminal, by the text of the cell, as in {"fails":
-            "yellow"}.
+        styles: Mapping from cell text to its style on a terminal, as in {"fails": "yellow"}.
     """
 
     headers: Sequence[str]
@@ -69,7 +68,7 @@ class TextTable(NamedTuple):
 
     @property
     def to_the_right(self) -> list[bool]:
-        """For each table column, True if its cells are aligned to the right, as numbers are.
+        """For each table column, True if its cells are right-aligned, as numbers are.
 
         If `align` has fewer letters than there are columns, its last letter applies to the
         remaining columns.
@@ -78,10 +77,10 @@ class TextTable(NamedTuple):
         return [letter == "r" for letter in letters]
 
     def rich(self) -> "Table":
-        """Converts the table to a table of the package Rich, which prints it on a terminal.
+        """Converts the table to a Rich table, which can be printed to a terminal.
 
-        The table has no borders. Cells are folded if the terminal is too narrow, except those
-        that consist of a hash.
+        The table has no borders. Cells wrap if the terminal is too narrow, except for those
+        that contain a hash.
         """
         from rich.table import Table
 
@@ -110,11 +109,11 @@ class TextTable(NamedTuple):
         return table
 
     def _list_cells(self, index: int) -> list[str]:
-        """Returns the cells of a column. Rows that are too short have no cell in it."""
+        """Returns the cells of a column, skipping rows that are too short to have one."""
         return [row[index] for row in self.rows if index < len(row)]
 
     def _find_hash_width(self, index: int) -> int | None:
-        """Returns the length of the longest hash in a column. `None` if it contains no hash."""
+        """Returns the length of the longest hash in a column, or `None` if there is no hash."""
         widths = []
         for cell in self._list_cells(index):
             widths += [len(digits) for digits in HASH.findall(cell)]
@@ -125,9 +124,9 @@ class TextTable(NamedTuple):
         return all(len(cell) <= width for cell in self._list_cells(index))
 
     def markdown(self) -> str:
-        """Renders the table in Markdown. Short rows are filled with empty cells.
+        """Renders the table as Markdown. Short rows are padded with empty cells.
 
-        A "|" in a cell is escaped, because it would begin a new column.
+        A "|" in a cell is escaped, because it would start a new column.
         """
         separators = ["--:" if right else "---" for right in self.to_the_right]
         rows = [self.titles, separators]
@@ -179,14 +178,14 @@ class TextTable(NamedTuple):
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """Formats a number for the cell of a table: 0.123 for 0.12345, and a dash for `None`.
+    """Formats a number for a table cell: 0.123 for 0.12345, and a dash for `None`.
 
     Args:
         value: The number, or `None`.
         digits: Number of significant digits.
 
     Returns:
-        The text. A dash for `None`.
+        The formatted number.
     """
     return "-" if value is None else f"{value:.{digits}g}"
 
@@ -195,9 +194,9 @@ class MarkedText(NamedTuple):
     """A line of a result's text that begins with a mark, such as a green "ok".
 
     Attributes:
-        mark: The mark in Rich's markup, as in "[green]ok[/green]". Empty for no mark.
+        mark: The mark in Rich markup, as in "[green]ok[/green]". Empty for no mark.
         text: The line.
-        failed: True if a command prints the line to standard error.
+        failed: True if commands print the line to standard error.
     """
 
     mark: str
@@ -208,7 +207,7 @@ class MarkedText(NamedTuple):
         """Returns the text as one line without colours, such as "ok all records".
 
         Returns:
-            A list with this line, because other parts of a result have several lines.
+            A list with a single line, since other kinds of block have several lines.
         """
         if not self.mark:
             return [self.text]
@@ -218,8 +217,8 @@ class MarkedText(NamedTuple):
     def html(self) -> "Markup":
         """Renders the mark and the text as one line of HTML, without colours.
 
-        The text may come from a file or from another computer. Therefore control characters are
-        replaced, and very long texts are cut.
+        The text may come from a file or from another computer, so control characters are
+        replaced and very long texts are truncated.
         """
         from .html_templates import render_macro
 
@@ -228,7 +227,7 @@ class MarkedText(NamedTuple):
 
 
 Block = str | MarkedText | TextTable
-"""A part of a result's text. An empty text is an empty line."""
+"""A part of a result's text. An empty string is an empty line."""
 
 _COMPOSERS = {
     "Certificate": "certificate_text:compose_certificate",
@@ -242,18 +241,21 @@ _COMPOSERS = {
     "PushedTwins": "certificate_text:compose_twins",
     "Rerun": "summary_text:compose_rerun",
 }
-"""Functions that compose the text of results, as "module:function", by class name."""
+"""Functions that compose the text of results, given as "module:function" and keyed by class
+name.
+"""
 _BRIEF_COMPOSERS = {
     "Certificate": "brief_text:compose_key_reasons",
     "LogMetrics": "brief_text:compose_key_metrics",
 }
-"""Functions that compose the ten most important lines of long results, by class name."""
+"""Functions that compose the ten most important lines of long results, keyed by class name."""
 
 
 def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTable]:
     """Collects the lines and tables that make up the text of a result.
 
-    The terminal, plain text and HTML all show these blocks. Their contents are therefore equal.
+    The terminal, plain text and HTML are all rendered from these blocks, and therefore have the
+    same content.
 
     Args:
         result: Result of a command, such as the metrics of a run.
@@ -261,8 +263,8 @@ def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTab
             comparison of logs.
 
     Returns:
-        The blocks in the order of the text. Each line is a `MarkedText`, whose mark, such as a
-        green "ok", may be empty.
+        The blocks in text order. Each line is a `MarkedText`, whose mark (such as a green "ok")
+        may be empty.
     """
     # A class may have methods for its text, or a function in this folder composes the text.
     compose_blocks = getattr(result, "brief_blocks", None) if brief else None
@@ -279,14 +281,14 @@ def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTab
 def _import_composer(
     result: Result, composers: Mapping[str, str]
 ) -> Callable[[Result], Iterable[Block]]:
-    """Imports the function that composes the text of a result, only when it is needed.
+    """Imports the function that composes the text of a result, when it is first needed.
 
-    If all such modules were imported at the start, every command would be slow. For a subclass
-    of a listed class, the function of the listed class is used.
+    Importing all such modules at startup would make every command slow. For a subclass of a
+    listed class, the function of the listed class is used.
 
     Args:
         result: The result.
-        composers: Functions as "module:function", by class name, such as `_COMPOSERS`.
+        composers: Functions as "module:function", keyed by class name, such as `_COMPOSERS`.
     """
     classes = [cls.__name__ for cls in type(result).__mro__]
     listed_class = next(name for name in classes if name in composers)
@@ -300,7 +302,7 @@ def summarize(result: Result) -> str:
     """Renders the result of a command as plain text, for printing it in a Python session.
 
     Args:
-        result: Result of a command or function, which yields its text by `blocks`.
+        result: Result of a command or function, which yields its text through `blocks`.
     """
     lines = []
     for block in compose(result):
@@ -312,6 +314,6 @@ def render_html(result: Result) -> str:
     """Renders the result of a command as HTML with tables, for example for a notebook.
 
     Args:
-        result: Result of a command or function, which yields its text by `blocks`.
+        result: Result of a command or function, which yields its text through `blocks`.
     """
     return "\n".join(block.html() for block in compose(result))

@@ -1,11 +1,11 @@
-"""Renders the recorded states of an arm as HTML, which Jupyter notebooks display.
+"""Renders the records of an arm as HTML for Jupyter notebooks.
 
-If `log["m1"]` is the last line of a notebook's cell, the notebook shows this HTML: a heading
-and a table that summarises each quantity over the run.
+A notebook shows this HTML when a cell ends with `log["m1"]`: a heading, and a table that
+summarises each quantity over the run.
 
 Invariant:
-    - The table contains only quantities that the records of this arm contain.
-    - Rendering does not change the records.
+    - The table contains only quantities that are present in the records of this arm.
+    - Rendering does not modify the records.
 """
 
 from collections.abc import Iterator
@@ -18,15 +18,15 @@ from .html_templates import render_macro
 from .result_text import TextTable, format_number
 
 FIELDS = ("q", "qd", "q_des", "e", "tau", "tau_x", "theta_hat", "x", "xd", "wrench")
-"""Vectors of a record that the table shows, a row per element."""
+"""Record vectors shown in the table, with one row per component."""
 
 
 def render_site_html(site: SiteLog) -> Markup:
-    """Renders the records of one site as HTML, for display in a notebook.
+    """Renders the records of a site as HTML, for display in a notebook.
 
-    The heading is followed by a table with a row per element of a record's vectors. A row
-    contains the first, last, smallest and largest value over the run. Without records there is
-    only the heading.
+    The heading is followed by a table with one row per vector component in a record. Each row
+    contains the first, last, smallest and largest value over the run. If there are no records,
+    only the heading is rendered.
 
     Args:
         site: Records of the site.
@@ -41,7 +41,7 @@ def render_site_html(site: SiteLog) -> Markup:
 
 
 def _list_rows(site: SiteLog) -> Iterator[list[str]]:
-    """Yields the rows of the table: the time, then a row per element of each vector."""
+    """Yields the rows of the table: the time, then one row per component of each vector."""
     start = format_number(float(site.t_s[0]))
     end = format_number(float(site.t_s[-1]))
     yield ["t_s", start, end, start, end, "time, s"]
@@ -54,7 +54,7 @@ def _list_rows(site: SiteLog) -> Iterator[list[str]]:
 
 
 def _summarize(values: Array) -> list[str]:
-    """Returns the first, last, smallest and largest of the values, shape (K,), as texts."""
+    """Returns the first, last, minimum and maximum of the values, shape (K,), as strings."""
     numbers = (values[0], values[-1], values.min(), values.max())
     return [format_number(float(number)) for number in numbers]
 

@@ -1,16 +1,18 @@
-"""Provides the common style of all figures, and draws the parts that they share.
+"""Provides the common style of all figures, and draws the elements that they share.
 
-A figure looks the same wherever it appears: each arm has its own colour, and arms beyond the
-number of colours are distinguished by dashes. This module provides the lines, axes, panels and
+A figure looks the same wherever it appears: each arm has its own colour, and if there are more
+arms than colours, dash patterns distinguish them. This module provides lines, axes, panels and
 legends in this style, and writes figures to files.
 
-Most figures show signals over the time of a run. `TimeFigure` draws them: panels with a line
-per arm, a time axis and a legend. Markers show when an arm did not follow the others (it held,
-braked or returned), and when a change was applied, such as another network delay.
+Most figures show signals over the time of a run. `TimeFigure` draws these, with one line per
+arm in each panel, a time axis and a legend. Markers show when an arm did not follow the others
+(because it held, braked or returned), and when a change such as a new network delay was
+applied.
 
 Invariant:
-    - Matplotlib's global state remains unchanged, so that users' own figures keep their style.
-    - Equal figures give equal bytes: files contain no date, and fonts are embedded as TrueType.
+    - Matplotlib's global state is left unchanged, so that users' own figures keep their style.
+    - Equal figures produce byte-identical files: files contain no date, and fonts are embedded
+      as TrueType.
     - Figures of a run without events have no markers.
 """
 
@@ -44,11 +46,11 @@ from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 from .plot_signals import decimate
 
 AxesGrid = NDArray[np.object_]
-"""Panels of a figure, shape (rows, columns), of `Axes`."""
+"""Grid of panels in a figure: an array of `Axes` with shape (rows, columns)."""
 LineOptions = dict[str, Any]
 """Options of a line: keyword arguments of `Axes.plot`."""
 LegendEntry = tuple[str, LineOptions]
-"""Text of a line in a legend, and the options of the line."""
+"""Legend label of a line, and the options of the line."""
 LegendEntries = Sequence[LegendEntry]
 
 DASHES: tuple[Any, ...] = (
@@ -57,27 +59,27 @@ DASHES: tuple[Any, ...] = (
     (0, (1, 1)),
     (0, (5, 1.5, 1, 1.5)),
 )
-"""Line styles: solid, and three patterns of dashes."""
+"""Line styles: solid, and three dash patterns."""
 REFERENCE = "#333333"
-"""Dark grey, the colour of references, limits and marks."""
+"""Dark grey, the colour of references, limits and markers."""
 FAINT = "#8c8c8c"
-"""Light grey, the colour of texts in empty panels and of bands."""
+"""Light grey, the colour of text in empty panels and of bands."""
 
 LIMIT_LINE: LineOptions = {
     "color": REFERENCE,
     "linestyle": (0, (4, 2)),
     "linewidth": 0.8,
 }
-"""Options of the line of a desired, true, stated or allowed value."""
+"""Options of a line at a desired, true, specified or permitted value."""
 
 REPORT_DPI = REPORT_SIZE.dpi
 _NOTEBOOK_DPI = 200
 _LEAST_RANGE = 1e-9
-"""If the range of values is smaller than this, they differ by rounding errors only."""
+"""If the range of values is smaller than this, they differ only by rounding errors."""
 BUCKETS_PER_PANEL = 700
-"""Number of intervals of time to which the signals of a panel are decimated.
+"""Number of time intervals to which the signals of a panel are decimated.
 
-Half a page is 700 pixels wide, and more points would not be visible.
+Half a page is 700 pixels wide, so more points would not be visible.
 """
 
 _STYLE_SHEET = resources.files("trilat_net.presentation") / "assets" / "figures.mplstyle"
@@ -95,12 +97,12 @@ _NARROW_RC: Any = {
 
 @contextmanager
 def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
-    """Provides an empty figure in the common style, for use in a `with` statement.
+    """Context manager that provides an empty figure in the common style.
 
-    The style applies only to what is drawn within the statement.
+    The style applies only to what is drawn within the `with` block.
 
     Args:
-        form: Width of the figure and sizes of its texts.
+        form: Width and font sizes of the figure.
         height_in: Height of the figure, in inches.
     """
     settings: Any = dict(_RC)
@@ -113,14 +115,14 @@ def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
 
 
 class _NotebookFigure(Figure):
-    """A Matplotlib figure that a Jupyter notebook displays as a picture.
+    """A Matplotlib figure that Jupyter notebooks display as a picture.
 
-    Without this class, a notebook would display only the size of the figure in words, because
-    figures are made without pyplot.
+    A notebook would otherwise display only a line of text with the size of the figure, because
+    figures are created without pyplot.
     """
 
     def _repr_png_(self) -> bytes:
-        """Returns the picture. Jupyter calls this method by its name."""
+        """Returns the picture as PNG. Jupyter calls this method by its name."""
         return _render_figure(self, "png", _NOTEBOOK_DPI)
 
     def _repr_html_(self) -> str:
@@ -135,7 +137,7 @@ class _NotebookFigure(Figure):
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
-    """Adds a grid of panels (parts with their own axes) to a figure.
+    """Adds a grid of panels (subplots) to a figure.
 
     Args:
         figure: The Matplotlib figure.
@@ -162,22 +164,22 @@ def site_colour(log: Log, site: str) -> str:
 
 
 _WIDEST_PT = 2.0
-"""Width of the line of the first site in a panel of all sites."""
+"""Line width of the first site in a panel that shows all sites, in pt."""
 _THINNER_PT = 1.2
-"""Difference between the line widths of the first and the last site in such a panel."""
+"""Difference in line width between the first and the last site in such a panel, in pt."""
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
-    """Returns the colour, dashes and width of the lines of an arm, for all figures.
+    """Returns the colour, dash pattern and width of an arm's lines, for all figures.
 
-    If there are more arms than colours, colours are repeated with dashes.
+    If there are more arms than colours, colours are reused with dashes.
 
     Args:
         log: Log with the site.
         site: Name of the site.
-        width: Width of the line, in pt. `None` if the lines of all sites are in one panel. In
-            that case each further site has a thinner line, so that lines on top of one another
-            remain visible.
+        width: Width of the line, in pt. `None` if the lines of all sites share one panel. In
+            that case each successive site has a thinner line, so that lines on top of one
+            another remain visible.
     """
     site_index = log.sites.index(site)
     last_index = len(log.sites) - 1
@@ -205,9 +207,9 @@ def site_title(log: Log, site: str) -> str:
 
 
 def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws a signal over time with fewer points, such that all extremes stay visible.
+    """Plots a signal over time with fewer points, while keeping all extremes visible.
 
-    A run has up to millions of values, far more than a figure has pixels.
+    A run can have millions of values, far more than a figure has pixels.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -221,9 +223,9 @@ def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options:
 
 
 def positive(values: Array) -> Array:
-    """Replaces zero and negative values by NaN, as a logarithmic axis cannot show them.
+    """Replaces zero and negative values with NaN, since a logarithmic axis cannot show them.
 
-    A line has a gap at NaN, while at zero it would extend to the edge of the panel.
+    A line has a gap at NaN, whereas at zero it would extend to the edge of the panel.
 
     Args:
         values: The values.
@@ -231,58 +233,12 @@ def positive(values: Array) -> Array:
     return np.where(values > 0.0, values, np.nan)
 
 
-SPREAD_BUCKETS = 120
-"""Number of intervals of time for which `plot_spread` draws a median and a band."""
-SPREAD: LineOptions = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
-"""Options of the line that represents the band of a spread in a legend."""
-
-
-def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws a fluctuating signal as its median in a band from least to largest value.
-
-    The time is divided into `SPREAD_BUCKETS` intervals with equal numbers of values. Each
-    interval gives a point of the median and of the edges of the band.
-
-    Args:
-        axes: Panel of the figure, as Matplotlib axes.
-        t_s: Times of the values, in s, shape (K,).
-        values: The values, shape (K,). NaN values are ignored.
-        **options: Options of the line of the median. They must include a "color", which also
-            applies to the band.
-    """
-    buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
-    points = []
-    for bucket in buckets:
-        if len(bucket):
-            middle_s = t_s[bucket].mean()
-            points.append((middle_s, *_compute_spread(values[bucket])))
-
-    middles_s, smallest, median, largest = np.array(points).reshape(-1, 4).T
-    axes.fill_between(
-        middles_s,
-        smallest,
-        largest,
-        color=options["color"],
-        alpha=SPREAD["alpha"],
-        linewidth=0.0,
-    )
-    axes.plot(middles_s, median, **options)
-
-
-def _compute_spread(values: Array) -> tuple[float, float, float]:
-    """Returns the least, median and largest of the finite values, or NaN if there are none."""
-    # NumPy prints a warning if all values are NaN.
-    if not np.isfinite(values).any():
-        return np.nan, np.nan, np.nan
-    return np.nanmin(values), np.nanmedian(values), np.nanmax(values)
-
-
 def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Labels a logarithmic axis with plain numbers, such as 20 instead of a power of 10.
+    """Labels a logarithmic axis with plain numbers, such as 20, instead of powers of 10.
 
     Args:
         axis: The axis.
-        steps: Multiples of each power of 10 that have a label.
+        steps: Multiples of each power of 10 to label.
     """
     axis.set_major_locator(LogLocator(subs=steps))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -291,10 +247,10 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
 
 
 def name_joints(log: Log) -> list[str]:
-    """Returns the titles of panels that show one joint each, such as "joint 1".
+    """Returns titles for panels that show one joint each, such as "joint 1".
 
-    Names of joints are added if the arms are chains whose joints all have the same names. The
-    number of titles is that of the arm with the most joints.
+    Joint names are added if the arms are chains that all use the same joint names. There are as
+    many titles as joints in the arm with the most joints.
 
     Args:
         log: Log with the arms.
@@ -317,9 +273,9 @@ def name_joints(log: Log) -> list[str]:
 
 
 def name_shared(log: Log) -> list[str]:
-    """Returns titles for the joints or axes with which the arms follow each other.
+    """Returns titles for the joints or axes in which the arms follow each other.
 
-    Axes are those of the task space, if the arms follow each other's end effectors.
+    These are task-space axes if the arms follow each other's end effectors.
 
     Args:
         log: Log with the arms.
@@ -330,40 +286,14 @@ def name_shared(log: Log) -> list[str]:
     return name_joints(log)
 
 
-def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Writes the name of a joint above each panel of a row, or another title.
-
-    Args:
-        log: Log with the joints.
-        row: A panel per title.
-        titles: The titles. Empty for the names of the joints.
-    """
-    for title, axes in zip(titles or name_joints(log), row, strict=True):
-        axes.set_title(title)
-
-
-def label_row(axes: Axes, text: str, form: FigureSize) -> None:
-    """Writes a label beside a row of low panels of a figure, in several lines.
-
-    A low panel has no room beside it for a long label in one line.
-
-    Args:
-        axes: First panel of the row, beside which the label is written.
-        text: The label. It is wrapped after 12 characters.
-        form: Size of the figure, which determines the size of the text.
-    """
-    lines = textwrap.wrap(text, 12)
-    axes.set_ylabel("\n".join(lines), fontsize=form.tick_pt)
-
-
 def flatten_rounding(axes: Axes) -> None:
     """Widens the value axis of a panel whose curves differ only by rounding errors.
 
-    Without this, Matplotlib would scale the axis to the rounding errors, and a constant would
-    look like noise.
+    Otherwise Matplotlib would scale the axis to the rounding errors, and a constant would look
+    like noise.
 
     Args:
-        axes: The panel. Its axis is changed in place.
+        axes: The panel. Its axis is modified in place.
     """
     low, high = axes.get_ylim()
     if high - low < _LEAST_RANGE:
@@ -371,15 +301,16 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class _JointPanels(NamedTuple):
-    """Panels of a figure in which each joint of the arms has a panel of its own.
+    """Panels of a figure in which each joint of the arms has its own panel.
 
-    `add_joint_panels` creates them.
+    Created by `TimeFigure.add_joint_panels`.
 
     Attributes:
-        joints: A panel per joint.
+        joints: One panel per joint.
         columns: Number of panels in a row.
-        lowest: Lowest panel of each column, which has the time axis.
-        below: Panel below the others, over the whole width. `None` if there is no such panel.
+        lowest: Bottom panel of each column, which has the time axis.
+        below: Panel below the others, spanning the whole width. `None` if there is no such
+            panel.
     """
 
     joints: list[Axes]
@@ -389,26 +320,26 @@ class _JointPanels(NamedTuple):
 
 
 def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
-    """Arranges the panels of joints in a grid with few rows and few empty cells.
+    """Arranges one panel per joint in a grid with few rows and few empty cells.
 
-    A robot arm has from two to about seven joints, and each gets a panel.
+    Arms typically have two to seven joints.
 
     Args:
         joints: Number of joints.
-        narrow: True if only two panels fit beside each other. Otherwise three or four fit.
+        narrow: True if only two panels fit side by side. Otherwise three or four fit.
 
     Returns:
-        The rows of the grid. A cell is the index of a joint as text, or "." if it is empty.
+        The rows of the grid. A cell is the index of a joint as a string, or "." if it is empty.
     """
 
     def count_cells(columns: int) -> tuple[int, int]:
-        """Returns the size of the grid of panels for a given number of columns.
+        """Returns the size of the panel grid for a given number of columns.
 
         Args:
             columns: Number of columns.
 
         Returns:
-            The number of rows, and the number of cells in the last row that stay empty.
+            The number of rows, and the number of empty cells in the last row.
         """
         rows = math.ceil(joints / columns)
         return rows, rows * columns - joints
@@ -424,56 +355,19 @@ def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
     return [cells[first : first + columns] for first in range(0, len(cells), columns)]
 
 
-def add_joint_panels(
-    figure: Figure, joints: int, form: FigureSize, below: str = ""
-) -> _JointPanels:
-    """Adds a panel per joint to a figure, and optionally a wide panel below them.
-
-    Two joints share one value axis. If there are more, each joint has its own, because the
-    torques of wrists are much smaller than those of shoulders.
-
-    Args:
-        figure: The Matplotlib figure.
-        joints: Number of joints.
-        form: Width, type sizes and resolution of the figure.
-        below: Name of the wide panel. Empty for no wide panel.
-    """
-    grid = arrange_joints(joints, form.narrow)
-    columns = len(grid[0])
-    rows = list(grid)
-    if below:
-        rows.append([below] * columns)
-    panels: dict[str, Axes] = figure.subplot_mosaic([[*row] for row in rows])
-    joint_panels = [panels[str(joint)] for joint in range(joints)]
-
-    # Only the lowest panel of a column has a labelled time axis.
-    for upper, lower in zip(joint_panels, joint_panels[columns:], strict=False):
-        upper.sharex(lower)
-        upper.tick_params(labelbottom=False)
-    if joints == 2:
-        joint_panels[1].sharey(joint_panels[0])
-        joint_panels[1].tick_params(labelleft=False)
-    return _JointPanels(
-        joints=joint_panels,
-        columns=columns,
-        lowest=joint_panels[-columns:],
-        below=panels.get(below),
-    )
-
-
 def typeset(text: str) -> str:
-    """Replaces "+-" and "->", which the terminal shows, by the signs ± and →.
+    """Replaces "+-" and "->", as used on the terminal, with the symbols ± and →.
 
-    For example "m1->s: 3 +- 1" becomes "m1 → s: 3 ± 1".
+    For example, "m1->s: 3 +- 1" becomes "m1 → s: 3 ± 1".
 
     Args:
-        text: A text for the terminal.
+        text: Text intended for the terminal.
     """
     return text.replace("+-", "±").replace("->", " → ")
 
 
 def typeset_unit(unit: str) -> str:
-    """Replaces "^2" in a unit by the sign ²: "rad/s^2" becomes "rad/s²".
+    """Replaces "^2" in a unit with the superscript ²: "rad/s^2" becomes "rad/s²".
 
     Args:
         unit: The unit, such as "rad/s^2".
@@ -481,29 +375,11 @@ def typeset_unit(unit: str) -> str:
     return unit.replace("^2", "²")
 
 
-def typeset_symbol(parameter: str) -> str:
-    """Returns the symbol of an inertial parameter for Matplotlib, with its index below.
-
-    An adaptive control law estimates such parameters, for example a mass or an inertia.
-
-    Args:
-        parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
-            as "mc_x", or the mass.
-    """
-    if parameter[0] == "I":
-        stem = parameter[:1]
-        index = parameter[1:]
-    else:
-        stem = parameter[:2]
-        index = parameter[3:]  # behind the underscore
-    return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
-
-
 _MAX_LEGEND_COLUMNS = 6
 
 
 def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
-    """Adds a legend, which names the lines, above the panels of a figure.
+    """Adds a legend for the lines above the panels of a figure.
 
     Args:
         figure: The Matplotlib figure.
@@ -521,7 +397,7 @@ def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None
 
     Args:
         figure: The Matplotlib figure.
-        handles: Matplotlib objects of the entries, which have a label.
+        handles: Matplotlib artists of the entries, each with a label.
         **options: Options of `Figure.legend`.
     """
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
@@ -538,10 +414,10 @@ def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None
 
 
 def site_legend_entries(log: Log, sites: Sequence[str]) -> list[LegendEntry]:
-    """Returns the entries of a legend that explains the lines of several sites.
+    """Returns legend entries that explain the lines of several sites.
 
-    A site is a process that runs one arm. An entry consists of a text, such as "m1 (master)",
-    and the colour, dashes and width of the site's line.
+    An entry consists of a text, such as "m1 (master)", and the colour, dash pattern and width
+    of the site's line.
 
     Args:
         log: Log with the sites.
@@ -555,13 +431,13 @@ _EMPTY_FIGURE_CHARACTERS_PER_IN = 17
 
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure that contains only a text: the reason why there is nothing to draw.
+    """Returns a figure that contains only text: the reason why there is nothing to draw.
 
-    A command that writes a figure thus always writes a file.
+    This ensures that a command that writes a figure always writes a file.
 
     Args:
         text: The reason.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     characters = round(_EMPTY_FIGURE_CHARACTERS_PER_IN * form.width_in)
     lines = textwrap.wrap(text, characters)
@@ -571,7 +447,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes the reason why there is nothing to show into an empty panel of a figure.
+    """Writes the reason why there is nothing to show into an empty panel.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -581,7 +457,7 @@ def annotate_empty_panel(axes: Axes, text: str) -> None:
 
 
 FIGURE_FORMATS = ("pdf", "png", "svg")
-"""Suffixes of the files to which figures can be written."""
+"""Suffixes of the file formats in which figures can be written."""
 
 _FILE_RC: Any = {
     "pdf.fonttype": 42,
@@ -597,25 +473,26 @@ _UNDATED: dict[str, dict[str, Any]] = {
 
 
 def write_figure(figure: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure to a file, in the format of the file's suffix, such as .pdf.
+    """Writes a figure to a file, in the format given by the suffix of the file, such as .pdf.
 
     Args:
         figure: The Matplotlib figure.
-        path: The file. Its suffix determines the format, which is one of `FIGURE_FORMATS`.
+        path: The file. Its suffix determines the format, which must be one of `FIGURE_FORMATS`.
         dpi: Resolution of a .png file.
 
     Raises:
         UsageError: The file cannot be created.
-        LogRefused: The disk refused the data.
+        LogRefused: The data could not be written to disk.
     """
     kind = path.suffix.removeprefix(".").lower()
     write_whole(path, _render_figure(figure, kind, dpi))
 
 
 def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
-    """Returns a figure as the bytes of a file that contains no date.
+    """Renders a figure to the bytes of a file that contains no date.
 
-    Without a date, the same figure always has the same bytes, so that files can be compared.
+    Without a date, the same figure always results in the same bytes, so that files can be
+    compared.
 
     Args:
         figure: The Matplotlib figure.
@@ -629,23 +506,25 @@ def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
 
 
 MOST_EXPLAINED_CHANGES = 12
-"""Largest number of changes explained in a figure; the page lists all changes."""
+"""Maximum number of changes explained in a figure; the page lists all changes."""
 
 SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
-"""Function of a site that returns ticks (K,), times in s (K,), and values (K, J)."""
+"""Function that takes the name of a site and returns ticks (K,), times in s (K,), and values
+(K, J).
+"""
 
 _HOLD_ALPHA = 0.22
 """Opacity of the shading while a site holds or brakes."""
 _RETURN_ALPHA = 0.09
 """Opacity of the shading while a site returns."""
 _LETTERS_PER_IN = 120.0
-"""Average number of letters per inch of a font of 1 pt."""
+"""Average number of letters per inch of a font with a size of 1 pt."""
 _CHANGE_LINE: LineOptions = {
     "color": REFERENCE,
     "linestyle": (0, (1, 1.5)),
     "linewidth": 0.7,
 }
-"""Options of the vertical line at a change."""
+"""Options of the vertical line that marks a change."""
 _CHANGE_NUMBER: dict[str, Any] = {
     "xytext": (1.5, -0.5),
     "textcoords": "offset points",
@@ -661,9 +540,9 @@ _CHANGE_NUMBER: dict[str, Any] = {
 
 
 def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
-    """Returns a function that reads the values to draw of any site of a log.
+    """Returns a function that reads the values to plot from any site of a log.
 
-    Figures pass this function to `TimeFigure.joint_row`, which calls it for each site (arm).
+    Figures pass it to `TimeFigure.joint_row`, which calls it for each site.
 
     Args:
         log: Log with the records of the sites.
@@ -671,18 +550,18 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
             is the number of values per record.
 
     Returns:
-        A function of the site's name that returns the ticks, times and values of its records.
+        A function that takes the name of a site and returns the ticks, times and values of its
+        records.
     """
 
     def read_signal(site: str) -> tuple[Ints, Array, Array]:
-        """Returns the ticks and times of an arm's K records, and the values to draw.
+        """Returns the ticks and times of an arm's K records, and the values to plot.
 
         Args:
             site: Name of the site.
 
         Returns:
-            The numbers of the ticks, shape (K,). Their times, shape (K,), in s. The values,
-            shape (K, J).
+            Ticks, shape (K,); their times in s, shape (K,); and values, shape (K, J).
         """
         records = log[site]
         return records.tick, records.t_s, values(records)
@@ -697,13 +576,13 @@ def time_figure(
     height_in: float,
     interval_s: tuple[float, float] | None = None,
 ) -> Iterator["TimeFigure"]:
-    """Provides an empty figure whose panels show a run over time, for use in a `with` block.
+    """Context manager that provides an empty figure whose panels show a run over time.
 
     Args:
         log: Log of the run.
-        form: Width of the figure and sizes of its texts.
+        form: Width and font sizes of the figure.
         height_in: Height of the figure, in inches.
-        interval_s: First and last time that the figure shows, in s. `None` for the whole run.
+        interval_s: Start and end of the time axis, in s. `None` for the whole run.
     """
     with styled_figure(form, height_in) as figure:
         yield TimeFigure(log, form, figure, interval_s)
@@ -712,14 +591,14 @@ def time_figure(
 class TimeFigure:
     """A figure that shows signals of a log over the time of the run, with markers.
 
-    `time_figure` creates it. A figure function adds panels to `figure`, draws into them with
-    `trace` or `joint_row`, and calls `finish` at the end.
+    Create it with `time_figure`. Then add panels to `figure`, draw into them with `trace` or
+    `joint_row`, and call `finish` at the end.
 
     Args:
         log: Log of the run.
-        form: Width of the figure and sizes of its texts.
+        form: Width and font sizes of the figure.
         figure: Empty Matplotlib figure.
-        interval_s: First and last time that the figure shows, in s. `None` for the whole run.
+        interval_s: Start and end of the time axis, in s. `None` for the whole run.
 
     Attributes:
         log: Log of the run.
@@ -735,7 +614,7 @@ class TimeFigure:
     ) -> None:
         self.log = log
         self.figure = figure
-        self._small_pt = form.small_pt
+        self._form = form
         timeline = Timeline(log)
         self._interval_s = interval_s or (0.0, timeline.end_s)
 
@@ -749,17 +628,49 @@ class TimeFigure:
         self._changes = list(enumerate(shown_changes, 1))
         self._modes = {site: timeline.find_mode_intervals(site) for site in log.sites}
 
+    def add_joint_panels(self, joints: int, below: str = "") -> _JointPanels:
+        """Adds one panel per joint to the figure, and optionally a wide panel below them.
+
+        Two joints share a value axis. With more joints, each has its own, because wrist torques
+        are much smaller than shoulder torques.
+
+        Args:
+            joints: Number of joints.
+            below: Name of the wide panel. Empty for no wide panel.
+        """
+        grid = arrange_joints(joints, self._form.narrow)
+        columns = len(grid[0])
+        rows = list(grid)
+        if below:
+            rows.append([below] * columns)
+        panels: dict[str, Axes] = self.figure.subplot_mosaic([[*row] for row in rows])
+        joint_panels = [panels[str(joint)] for joint in range(joints)]
+
+        # Only the lowest panel of a column has a labelled time axis.
+        for upper, lower in zip(joint_panels, joint_panels[columns:], strict=False):
+            upper.sharex(lower)
+            upper.tick_params(labelbottom=False)
+        if joints == 2:
+            joint_panels[1].sharey(joint_panels[0])
+            joint_panels[1].tick_params(labelleft=False)
+        return _JointPanels(
+            joints=joint_panels,
+            columns=columns,
+            lowest=joint_panels[-columns:],
+            below=panels.get(below),
+        )
+
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
     ) -> None:
-        """Draws a line over time with a value for each record of a site, in the site's colour.
+        """Plots one value per record of a site over time, in the colour of the site.
 
         If a run has more records than the figure has pixels, only the extremes are drawn.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             site: Name of the site.
-            values: A value per record, shape (K,).
+            values: One value per record, shape (K,).
             width: Width of the line, see `site_line`.
             **options: Options of the line, which take precedence over those of the site.
         """
@@ -768,15 +679,16 @@ class TimeFigure:
         plot_decimated(axes, records.tick, records.t_s, values, **line_options)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Draws a signal over time into a row of panels, a panel per joint and a line per arm.
+        """Plots a signal over time, with one panel per joint and one line per arm.
 
-        Times in which an arm does not follow other arms are shaded, and changes of settings are
+        Intervals in which an arm does not follow the others are shaded, and setting changes are
         marked.
 
         Args:
-            row: The panels, as Matplotlib axes.
+            row: One panel per joint, as Matplotlib axes.
             sites: Names of the sites.
-            signal: Function of a site's name that returns its ticks, times and values.
+            signal: Function that takes the name of a site and returns its ticks, times and
+                values.
         """
         for site in sites:
             tick, t_s, values = signal(site)
@@ -792,17 +704,17 @@ class TimeFigure:
     def mark(
         self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True
     ) -> None:
-        """Marks interruptions and changes of settings during the run in a panel.
+        """Marks interruptions and setting changes during the run in a panel.
 
-        The panel is shaded in the colour of a site (arm) while the site does not follow its
-        peers. It has a vertical line at each change that the sites applied.
+        The panel is shaded in the colour of a site while that site does not follow its peers. A
+        vertical line marks each change that the sites applied.
 
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             sites: Names of the sites whose events are marked.
             link: Name of a link, such as "m1->s", to mark only the changes of this link. Empty
                 to mark all changes.
-            numbered: True to write the number of each change, which the text below the panels
+            numbered: True to add the number of each change, which the text below the panels
                 explains.
         """
         for site in sites:
@@ -816,8 +728,8 @@ class TimeFigure:
     def _shade_modes(self, axes: Axes, site: str) -> None:
         """Shades a panel in the colour of a site while the site does not follow its peers.
 
-        The shading shows when an arm held its position, braked or returned, for example after
-        the network was interrupted.
+        The shading shows when an arm held its position, braked or returned, for example after a
+        network interruption.
         """
         colour = site_colour(self.log, site)
         for mode, from_s, to_s in self._modes[site]:
@@ -839,7 +751,7 @@ class TimeFigure:
         Args:
             axes: Panel of the figure, as Matplotlib axes.
             at_s: Time of the change, in s.
-            number: Number of the change as text. Empty to write no number.
+            number: Number of the change, as a string. Empty to omit the number.
         """
         axes.axvline(at_s, zorder=0.6, **_CHANGE_LINE)
         if number:
@@ -848,7 +760,7 @@ class TimeFigure:
                 xy=(at_s, 1.0),
                 # x in s, y from 0 to 1 over the height of the panel
                 xycoords=axes.get_xaxis_transform(),
-                fontsize=self._small_pt,
+                fontsize=self._form.small_pt,
                 **_CHANGE_NUMBER,
             )
 
@@ -860,15 +772,15 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Completes a drawn figure with time axes, a legend, and a text about marked changes.
+        """Completes a figure with time axes, a legend, and a text about the marked changes.
 
-        A function that draws a figure calls this last.
+        Functions that draw a figure call this last.
 
         Args:
-            lowest: Lowest panel of each column, which gets a time axis.
+            lowest: Bottom panel of each column, which gets a time axis.
             entries: Entries of the legend.
-            links: False to explain all changes of settings below the panels. True to explain
-                only changes of network links, because the panels mark no other changes.
+            links: False to explain all setting changes below the panels. True to explain only
+                link changes, if the panels mark no others.
             title: Title of the legend. Empty for no title.
         """
         for axes in lowest:
@@ -881,11 +793,13 @@ class TimeFigure:
         self._add_footnote(self._explain_changes(links=links), self._explain_shading())
 
     def _add_footnote(self, *sentences: str) -> None:
-        """Writes sentences below the panels, each on a new line. Empty sentences are left out.
+        """Writes sentences below the panels, each on a new line. Empty sentences are skipped.
 
-        For example, the sentences explain the marked changes and the shaded times.
+        These can explain, for example, the marked changes and the shaded intervals.
         """
-        letters_per_line = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
+        letters_per_line = int(
+            _LETTERS_PER_IN * self.figure.get_figwidth() / self._form.small_pt
+        )
         lines: list[str] = []
         for sentence in sentences:
             lines += textwrap.wrap(sentence, letters_per_line)
@@ -894,17 +808,17 @@ class TimeFigure:
                 typeset("\n".join(lines)),
                 x=0.01,
                 ha="left",
-                fontsize=self._small_pt,
+                fontsize=self._form.small_pt,
                 color=REFERENCE,
             )
 
     def _explain_changes(self, *, links: bool) -> str:
-        """Returns a sentence that explains the numbered marks of changes in a figure.
+        """Returns a sentence that explains the numbered change marks in a figure.
 
-        An example of a change is a new network delay from a certain time on.
+        An example of a change is a network delay that differs from a certain time on.
 
         Args:
-            links: True to explain changes of links only.
+            links: True to explain only link changes.
 
         Returns:
             The sentence. Empty if there are no changes.
@@ -923,7 +837,7 @@ class TimeFigure:
         return f"Changes: {'; '.join(listed_texts)}"
 
     def _explain_shading(self) -> str:
-        """Returns a sentence that explains the shaded times. Empty if nothing is shaded."""
+        """Returns a sentence that explains the shaded intervals. Empty if nothing is shaded."""
         meanings = set()
         for intervals in self._modes.values():
             meanings |= {interval.meaning for interval in intervals}

@@ -1,19 +1,19 @@
 """Composes the text that commands print about a run, a live session and this machine.
 
-Each function `compose_...` turns the result of one command into lines and tables, which
+Each `compose_...` function turns the result of one command into lines and tables, which
 `terminal_output` prints. The results are about:
 
-- a run: its summary, metrics, checks of its log, recovery of its log, and repeated execution,
-- a live session: `compose_ping`, `compose_topic_delays`,
+- a run: its summary, its metrics, the checks and recovery of its log, and its re-execution,
+- a live session: `compose_ping`,
 - this machine: `compose_doctor`, `compose_benchmark`.
 
 `format_run_lines` lists the notable facts of a run, such as alarms, changed settings, and
-messages of users' control laws.
+messages from users' control laws.
 
 Invariant:
     - Links with a constant delay and no loss are not listed among the notable facts.
-    - A dash stands for a missing number. If the quantity is meaningful for the run, the reason
-      why the number is missing is written below the tables.
+    - Missing numbers are shown as a dash. If the quantity is meaningful for the run, the reason
+      why it is missing is given below the tables.
 """
 
 import math
@@ -25,10 +25,8 @@ from ..analysis import (
     LogMetrics,
     Metric,
     Quantity,
-    RunView,
     Timeline,
     link_summary,
-    measure_undelayed_error,
 )
 from ..errors import count_nouns
 from ..execution import LogCheckReport, Rerun
@@ -39,26 +37,26 @@ from .result_text import MARKS, Block, MarkedText, TextTable
 from .untrusted_text import sanitize
 
 MOST_LINES = 12
-"""Largest number of lines of each kind. The file summary.json contains all of them."""
+"""Maximum number of lines of each kind. The file summary.json contains all of them."""
 MOST_LINE_CHARACTERS = 400
-"""Largest length of a message of a user law or an external arm."""
+"""Maximum length of a message from a user law or an external arm."""
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
-"""Kinds of the events about user laws and external arms."""
+"""Kinds of events about user laws and external arms."""
 _MAX_LOCATIONS = 10
-"""Largest number of listed locations of a failed check. The JSON output contains all."""
+"""Maximum number of locations listed for a failed check. The JSON output contains all."""
 _MAX_LOSSES = 10
-"""Largest number of listed losses of a recovery. The JSON output contains all."""
+"""Maximum number of losses listed for a recovery. The JSON output contains all."""
 _NO_NUMBER = "–"
-"""Cell of a missing number."""
+"""Cell content for a missing number."""
 _MAX_FREQUENCIES = 16
-"""Largest number of listed frequencies of a response. The JSON output contains all."""
+"""Maximum number of frequencies listed for a response. The JSON output contains all."""
 
 
 def compose_log(log: Log) -> Iterator[Block]:
     """Yields the text with which a command introduces a recorded run.
 
-    It consists of a line about the session, a table with a row per arm, and the notable facts
-    of the run, such as alarms and changes of settings.
+    The text consists of a line about the session, a table with one row per arm, and the notable
+    facts of the run, such as alarms and setting changes.
 
     Args:
         log: Log of the run.
@@ -75,32 +73,32 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns lines about notable facts of a run, such as alarms and changed delays.
+    """Returns lines about the notable facts of a run, such as alarms and changed delays.
 
-    The lines concern alarms, user code, links, changes, modes and clocks. Long lists are cut,
-    see `_limit_lines`.
+    The lines cover alarms, user code, links, changes, modes and clocks. Long lists are
+    truncated, see `_limit_lines`.
 
     Args:
         log: Log of the run.
 
     Raises:
-        LogError: A record names a change that does not exist in the log.
+        LogError: A record refers to a change that does not exist in the log.
     """
     return [
         *_limit_lines([f"*** {alarm}" for alarm in Timeline(log).alarms]),
-        *format_outside_lines(log),
-        *format_link_lines(log),
+        *_format_outside_lines(log),
+        *_format_link_lines(log),
         *_format_change_lines(log),
         *_format_mode_lines(log),
-        *format_clock_lines(log),
+        *_format_clock_lines(log),
     ]
 
 
-def format_outside_lines(log: Log) -> list[str]:
-    """Returns the messages that users' control laws and external arms left in a log, as lines.
+def _format_outside_lines(log: Log) -> list[str]:
+    """Returns lines with the messages that users' control laws and external arms left in a log.
 
-    These texts come from other programs. Therefore they are cut to a bounded length, and
-    characters that could control the terminal are replaced by spaces.
+    These strings come from other programs, so they are truncated, and characters that could
+    control the terminal are replaced with spaces.
 
     Args:
         log: Log of the run.
@@ -117,12 +115,11 @@ def format_outside_lines(log: Log) -> list[str]:
     return _limit_lines(lines)
 
 
-def format_link_lines(log: Log) -> list[str]:
-    """Returns a line for each network link whose delay varies or which loses messages.
+def _format_link_lines(log: Log) -> list[str]:
+    """Returns one line for each link whose delay varies or which loses samples.
 
-    A link transmits the state of one arm to another, as a message (sample) per control period.
-    A line contains the delay that the scenario states for the link, the measured one-way delay,
-    the age of the messages in use, and the losses.
+    A line contains the delay specified in the scenario, the measured one-way delay, the age of
+    the samples in use, and the losses.
 
     Args:
         log: Log of the run.
@@ -151,10 +148,9 @@ def format_link_lines(log: Log) -> list[str]:
 
 
 def _format_change_lines(log: Log) -> list[str]:
-    """Returns a line of text for each change of a setting during the run.
+    """Returns one line for each setting change during the run.
 
-    A change is a command to an arm, a new delay of a network link, or new weights with which an
-    arm follows the others (dominance factors).
+    A change is a command to an arm, a new link delay, or new dominance factors.
 
     Args:
         log: Log of the run.
@@ -168,7 +164,7 @@ def _format_change_lines(log: Log) -> list[str]:
 
 
 def _format_mode_lines(log: Log) -> list[str]:
-    """Returns a line for each arm that at times did not follow the others.
+    """Returns one line for each arm that at times did not follow the others.
 
     The line says when the arm held its position, braked or returned, for example "m1: held
     2.100-2.600 s".
@@ -192,10 +188,10 @@ def _format_mode_lines(log: Log) -> list[str]:
     return lines
 
 
-def format_clock_lines(log: Log) -> list[str]:
-    """Returns a line for each link whose two sites have different clocks.
+def _format_clock_lines(log: Log) -> list[str]:
+    """Returns one line for each link whose two sites have different clocks.
 
-    The line states the difference between the clocks, because measured delays depend on it.
+    The line states the difference between the clocks, on which measured delays depend.
 
     Args:
         log: Log of the run.
@@ -210,7 +206,7 @@ def format_clock_lines(log: Log) -> list[str]:
 
 
 def _format_stated_models(summary: link_summary.LinkSummary) -> str:
-    """Returns how a link delays and loses messages during a run, as its scenario states.
+    """Returns the delays and losses that a scenario specifies for a link during a run.
 
     For example: "constant 400 ms, then constant 800 ms from 5 s on".
 
@@ -236,7 +232,7 @@ def _format_clock(use: link_summary.ClockSummary) -> str:
         use: Summary of the difference over the run.
 
     Returns:
-        The offset, the bound of its error, its drift and faults, as text.
+        The offset, its error bound, its drift and faults, as text.
     """
     bound_text = (
         f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
@@ -255,7 +251,7 @@ def _format_clock(use: link_summary.ClockSummary) -> str:
 
 
 def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -> str:
-    """Formats the mean, deviation, 99th percentile and largest value of times, in ms.
+    """Formats the mean, deviation, 99th percentile and maximum of times, in ms.
 
     Args:
         spread: Statistics of the times.
@@ -269,14 +265,12 @@ def _format_spread(spread: link_summary.ValueStatistics, unit_ms: float = 1.0) -
 
 
 def _format_number(value: float) -> str:
-    """Returns a number with three digits, or more if it is 100 or larger."""
+    """Formats a number with three digits, or more if it is 100 or larger."""
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
 def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
-    """Returns number and percentage of a network link's messages that were not used, by reason.
-
-    Such a message has the state that one arm sends to another in each control period.
+    """Returns the number and percentage of a link's samples that were not used, by reason.
 
     Args:
         use: Summary of the link.
@@ -301,7 +295,7 @@ def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleC
 
 
 def _limit_lines(lines: list[str]) -> list[str]:
-    """Returns at most `MOST_LINES` lines, and a line that counts the remaining ones."""
+    """Returns at most `MOST_LINES` lines, plus one with the number of remaining lines."""
     more = len(lines) - MOST_LINES
     if more <= 0:
         return lines
@@ -309,7 +303,7 @@ def _limit_lines(lines: list[str]) -> list[str]:
 
 
 def compose_verification(report: LogCheckReport) -> Iterator[Block]:
-    """Yields the results of the checks of a log for the user, one line per check.
+    """Yields the results of the log checks for the user, one line per check.
 
     If all checks passed, the notable facts of the run follow.
 
@@ -323,9 +317,9 @@ def compose_verification(report: LogCheckReport) -> Iterator[Block]:
 
 
 def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
-    """Yields the result of the checks of a log file: a line per check.
+    """Yields the results of checking a log file, one line per check.
 
-    After each failed check, lines name the places in the file at which it failed.
+    Each failed check is followed by lines that give the places in the file at which it failed.
 
     Args:
         report: Results of the checks.
@@ -347,7 +341,7 @@ def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
 
 
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
-    """Yields the outcome of recovering a log that was cut off.
+    """Yields the outcome of recovering a truncated log.
 
     The first line names the new file. A table lists which records were recovered, and which
     were lost or are missing.
@@ -382,13 +376,13 @@ def compose_recovery(recovery: Recovery) -> Iterator[Block]:
 
 
 def compose_rerun(rerun: Rerun) -> Iterator[Block]:
-    """Yields the result of executing some sites of a log again with changed settings.
+    """Yields the result of re-executing some sites of a log with changed settings.
 
     The text names the executed sites and the changed settings, and compares the motion of each
-    site and the ages of the samples of each link with the log.
+    site and the sample ages of each link with the log.
 
     Args:
-        rerun: Result of the new execution.
+        rerun: Result of the re-execution.
     """
     request = rerun.request
     recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
@@ -443,44 +437,36 @@ def _compare_undelayed_errors(rerun: Rerun) -> dict[str, tuple[float, float]]:
     """Returns how far arms were from the others at the same time, in a log and in its rerun.
 
     The tracking error compares an arm with delayed states of the others. The undelayed error
-    compares it with their states at the same time, and shows the effect of another delay. The
-    runs are compared at the times at which both have a record. Sites that follow no other site
-    have no such error, and are left out.
+    compares it with their states at the same time, and shows the effect of a different delay.
+    The runs are compared at times for which both have a record. Sites that follow no other site
+    have no such error, and are omitted.
 
     Returns:
-        Largest undelayed error in the log and in the rerun, by site.
+        For each site, the largest undelayed error in the log and in the rerun.
     """
-    logged_run = RunView(rerun.before)
-    repeated_run = RunView(rerun.after)
-    key = "undelayed_max_rad" if shared_unit(rerun.before) == "rad" else "undelayed_max_m"
-    errors = {}
-    for site, effect in rerun.sites.items():
-        if not effect.compared:
-            continue
-        logged_error = measure_undelayed_error(logged_run, site, repeated_run)[key].value
-        repeated_error = measure_undelayed_error(repeated_run, site, logged_run)[key].value
-        if logged_error is not None and repeated_error is not None:
-            errors[site] = (logged_error, repeated_error)
-    return errors
+    sites = [site for site, effect in rerun.sites.items() if effect.compared]
+    logged = LogMetrics.find_undelayed_maxima(rerun.before, sites, rerun.after)
+    repeated = LogMetrics.find_undelayed_maxima(rerun.after, sites, rerun.before)
+    return {site: (logged[site], repeated[site]) for site in logged if site in repeated}
 
 
 _USED_FIELD = "used["
-"""Start of the name of a record's field with the tick of a peer's sample in use."""
+"""Prefix of record fields that contain the tick of the peer sample in use."""
 
 
 def _name_sample(tick: object) -> str:
-    """Returns the name of a peer's sample in use by its tick, which is -1 before the first."""
+    """Returns a name for the peer sample in use, from its tick (-1 before the first sample)."""
     return "none" if tick == -1 else f"that of tick {tick}"
 
 
 def _describe_site_effect(rerun: Rerun, site: str) -> list[str]:
-    """Returns lines about the differences between the log of an arm and its repeated execution.
+    """Returns lines about the differences between the log of an arm and its re-execution.
 
     The lines state the largest deviation of the joint angles, and the first value that differs.
 
     Args:
-        rerun: Result of the new execution.
-        site: Name of the site, the process of the arm.
+        rerun: Result of the re-execution.
+        site: Name of the site.
     """
     effect = rerun.sites[site]
     rate_hz = rerun.request.scenario.sites[site].rate_hz
@@ -509,7 +495,7 @@ def _describe_site_effect(rerun: Rerun, site: str) -> list[str]:
 
 
 def _describe_link_effect(rerun: Rerun, name: str) -> str:
-    """Returns a sentence that compares the ages of a link's samples in log and rerun."""
+    """Returns a sentence that compares a link's sample ages in the log and in the rerun."""
     link = rerun.links[name]
     mean_ms = link.age_mean_ms
     max_ms = link.age_max_ms
@@ -519,10 +505,10 @@ def _describe_link_effect(rerun: Rerun, name: str) -> str:
 
 
 def _format_difference(before: object, after: object) -> tuple[str, str]:
-    """Formats two different values such that their texts differ.
+    """Formats two different values such that the resulting strings differ.
 
-    Numbers have six digits. If the texts are then equal, the numbers are printed with all
-    digits.
+    Numbers are written with six digits, or with all digits if the strings would otherwise be
+    equal.
 
     Args:
         before: The value in the first log.
@@ -538,7 +524,7 @@ def _format_difference(before: object, after: object) -> tuple[str, str]:
 def compose_doctor(report: Result) -> Iterator[Block]:
     """Yields the results of checking whether this machine is ready for a session.
 
-    Each finding has a line, with a mark for good, doubtful or bad.
+    Each finding is printed on its own line, marked as good, doubtful or bad.
 
     Args:
         report: Result of `trilat doctor`.
@@ -550,9 +536,9 @@ def compose_doctor(report: Result) -> Iterator[Block]:
 def compose_ping(report: Result) -> Iterator[Block]:
     """Yields tables of the round trip times in a session.
 
-    One table contains the times to the members, the processes that take part in the session:
-    sites and recorders. The other contains the times between sites. The second table exists
-    only if the sites have measured these times.
+    The first table contains the round trip times to the members of the session (sites and
+    recorders). A second table contains the times between sites, if the sites have measured
+    them.
 
     Args:
         report: Result of the measurement.
@@ -596,66 +582,8 @@ def compose_ping(report: Result) -> Iterator[Block]:
         yield TextTable(link_headers, rows, align="llr")
 
 
-_BARS = " ▁▂▃▄▅▆▇█"
-"""Bars of a histogram in text, by their height in eighths."""
-_DELAY_KEYS = ("min", "p50", "p99", "max")
-
-
-def compose_topic_delays(report: Result) -> Iterator[Block]:
-    """Yields a table of the delays with which the messages of a ROS 2 topic arrive.
-
-    There is a row per publishing program. The last column is a histogram of the delays, from
-    the smallest to the largest one.
-
-    Args:
-        report: Result of the measurement.
-    """
-    measurement = report.to_dict()
-    duration = f"{measurement['lasted_s']:.3g} s"
-    yield f"/{measurement['topic']}, {duration}; times in us, from sending to arrival"
-
-    rows = []
-    has_negative_delay = False
-    for publisher in measurement["publishers"]:
-        delays_us = publisher["delay_us"]
-        if delays_us["min"] < 0.0:
-            has_negative_delay = True
-
-        cells = [
-            publisher["gid"][:8],
-            publisher["type"],
-            str(publisher["messages"]),
-            str(publisher["lost"]),
-            f"{publisher['rate_hz']:.1f}",
-        ]
-        cells += [f"{delays_us[key]:.0f}" for key in _DELAY_KEYS]
-        cells.append(_draw_histogram(publisher["histogram"]["counts"]))
-        rows.append(cells)
-    headers = ("publisher", "type", "messages", "lost", "Hz", *_DELAY_KEYS, "min to max")
-    yield TextTable(headers, rows, align="llrrrrrrrl")
-
-    if has_negative_delay:
-        yield "delays below 0: the publisher's clock is ahead of the clock of this machine"
-    yield "between two machines, delays contain the offset of the clocks"
-
-
-def _draw_histogram(counts: Sequence[int]) -> str:
-    """Draws a histogram as one line of text, with a block character for each bin.
-
-    Args:
-        counts: Number of messages in each bin. At least one bin must have a message.
-    """
-    largest = max(counts)
-    bars = ""
-    for count in counts:
-        # Rounded up, so that a bin with a single message has a visible bar.
-        height_eighths = math.ceil(8 * count / largest)
-        bars += _BARS[height_eighths]
-    return bars
-
-
 def _describe_clock(member: dict[str, Any]) -> str:
-    """Returns the offset of a member's clock in s, and the bound of its error in us."""
+    """Returns the offset of a member's clock in s, and its error bound in us."""
     if member["same_clock"]:
         return "the same clock"
     if "offset_ns" not in member:
@@ -664,11 +592,11 @@ def _describe_clock(member: dict[str, Any]) -> str:
 
 
 def compose_benchmark(benchmark: Result) -> Iterator[Block]:
-    """Yields the delays of this machine's transports, and a judgement on each transport.
+    """Yields the delays of the transports on this machine, with a verdict on each transport.
 
-    A transport is a way to send messages between two processes. The table has a row per
-    transport, size of message and rate. The judgement compares the delay with the requirements
-    of a scenario.
+    A transport is a way to send messages between two processes. The table has one row per
+    transport, message size and rate. The verdict compares the delay with the requirements of a
+    scenario.
 
     Args:
         benchmark: Result of the measurement.
@@ -715,15 +643,15 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
 
     Args:
         transport: Measured delays and losses of the transport. `p99_ms` is the 99th percentile
-            of the delay, `None` if no message returned. `hidden` is True if it is at most
+            of the delay, or `None` if no message returned. `hidden` is True if it is at most
             `held_ms`. `age_ms` is the age at which samples would be used. `spare_ms` is the
-            additional age up to which the loop stays stable. It is `None` if the loop is not
-            stable, or if this is not known. `lost_share` is the fraction of lost messages, and
+            additional age up to which the loop remains stable, or `None` if the loop is not
+            stable or this is unknown. `lost_share` is the fraction of lost messages, and
             `playout_ms` is the largest delay, rounded up.
         needs: Message sizes, rates and time limits of the scenario. `held_ms` is the time for
             which its links hold each sample before it is used, so that shorter delays have no
-            effect. `stable_ms` lists the ages at which the loop is stable, `None` if they are
-            not known.
+            effect. `stable_ms` lists the ages at which the loop is stable, or is `None` if they
+            are unknown.
     """
     if transport["p99_ms"] is None:
         return "no message returned"
@@ -752,9 +680,9 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
     """Yields the tables with the metrics of a run.
 
-    There is a table for each group of quantities, with a column for each subject: the run, an
-    arm, a network link, or a wall. Further tables describe what operators feel: forces,
-    stiffness and impedance. The reasons why numbers are missing come last.
+    There is one table per group of quantities, with one column per subject: the run, an arm, a
+    link, or a wall. Further tables describe what operators feel: forces, stiffness and
+    impedance. The reasons for missing numbers come last.
 
     Args:
         metrics: The metrics of the run.
@@ -771,22 +699,23 @@ def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _explain_missing(subject: str, reason: str) -> MarkedText:
-    """Returns a dash, which stands for missing numbers, and the reason why they are missing."""
+    """Returns a dash, which stands for missing numbers, with the reason."""
     return MarkedText(f"[bold]{_NO_NUMBER}[/bold]", f"{subject}: {sanitize(reason)}")
 
 
 def _compose_group(
     group: str, members: Sequence[Quantity], metrics: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
-    """Yields a table of metrics with a row per quantity and a column per arm, link or wall.
+    """Yields a table of metrics with one row per quantity and one column per arm, link or wall.
 
-    Rows and columns without any number that applies to the run are left out.
+    Rows and columns without any applicable numbers are omitted.
 
     Args:
         group: Heading of the table.
-        members: Quantities of the group, all about the same kind of subject.
+        members: Quantities of the group, all for the same kind of subject.
         metrics: Metrics of the run.
-        reasons: Dictionary to which the names of missing numbers are added, by the reason.
+        reasons: Mapping from reason to the names of missing numbers, which is extended in
+            place.
     """
     values = {quantity: metrics.values_of(quantity) for quantity in members}
     applicable = {
@@ -822,8 +751,8 @@ def _compose_group(
 def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
     """Yields a table of the forces that an arm at rest feels while another arm is pushed.
 
-    The expected force follows from the dominance factors, the weights with which the arms
-    follow each other. Yields nothing if no arm was at rest while another one was pushed.
+    The expected force follows from the dominance factors. Yields nothing if no arm was at rest
+    while another one was pushed.
     """
     if not metrics.sharing_ratios:
         return
@@ -872,7 +801,7 @@ def _compose_sharing(metrics: LogMetrics) -> Iterator[Block]:
 def _compose_stiffness(metrics: LogMetrics) -> Iterator[Block]:
     """Yields a table of the stiffness that operators felt at the arms.
 
-    The stiffness is the change of an operator's torque over the change of the joint angle, for
+    The stiffness is the change in an operator's torque over the change in joint angle, for
     example against a wall that another arm touches. Yields nothing if no stiffness was
     measured.
     """
@@ -906,9 +835,9 @@ def _compose_stiffness(metrics: LogMetrics) -> Iterator[Block]:
 
 
 def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields a table of the impedance that sites felt, with a row per frequency.
+    """Yields a table of the impedance felt at the sites, with one row per frequency.
 
-    An impedance is the ratio of force to motion as a function of frequency. At most about
+    The impedance is the ratio of force to motion as a function of frequency. At most about
     `_MAX_FREQUENCIES` frequencies are listed. Yields nothing if no impedance was measured.
     """
     if not metrics.responses:
@@ -945,12 +874,12 @@ def _apply_any(metrics: Iterable[Metric]) -> bool:
 
 
 def _format_metric(metric: Metric) -> str:
-    """Returns the value of a metric with four digits, or a dash if there is no value."""
+    """Formats the value of a metric with four digits, or as a dash if there is no value."""
     return _NO_NUMBER if metric.value is None else _format_value(metric.value)
 
 
 def _format_value(value: float) -> str:
-    """Returns a number with four digits, or all digits of a whole number."""
+    """Formats a number with four digits, or with all digits if it is an integer."""
     is_whole = value == int(value) and abs(value) < 1e6
     return f"{value:.0f}" if is_whole else f"{value:.4g}"
 
@@ -958,14 +887,14 @@ def _format_value(value: float) -> str:
 def _tabulate(
     heads: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int
 ) -> Iterator[Block]:
-    """Yields a table and then an empty line for the terminal.
+    """Yields a table followed by an empty line for the terminal.
 
     Args:
         heads: Header of each column. If the last header is empty, the last column contains
-            texts.
+            text.
         rows: Cells of each row.
-        text_columns: Number of columns at the left that contain texts and are aligned to the
-            left. The other columns contain numbers and are aligned to the right.
+        text_columns: Number of columns on the left that contain text and are left-aligned. The
+            other columns contain numbers and are right-aligned.
     """
     last_letter = "r" if heads[-1] else "l"
     alignment = "l" * text_columns + "r" * (len(heads) - text_columns - 1) + last_letter

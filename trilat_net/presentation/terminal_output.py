@@ -1,17 +1,17 @@
 """Prints lines, tables, a progress bar and warnings to the terminal, for all commands.
 
-Texts may come from files or from other computers on the network. Such a text could contain
-control characters that move the cursor or hide other texts. Therefore all texts pass through
-this module, which makes them safe (`untrusted_text`).
+Strings may come from files or from other computers on the network, and could contain control
+characters that move the cursor or hide other text. Everything is therefore printed through this
+module, which makes it safe (`untrusted_text`).
 
 Invariant:
-    - No control character reaches a terminal, whatever the origin of a text: `TextConsole` and
-      `print_line` escape control characters.
-    - Text from a file or from another process is also passed through `sanitize`, which limits
-      its length.
-    - Code below the commands is independent of the progress bar. It calls a function with
+    - No control character reaches a terminal, whatever the origin of a string: `TextConsole`
+      and `print_line` escape control characters.
+    - Strings from a file or from another process are also passed through `sanitize`, which
+      limits their length.
+    - Code below the commands does not depend on the progress bar; it calls a function with
       (done, total).
-    - The top of this module imports only Rich, so that `trilat --help` stays fast.
+    - At module level, only Rich is imported, so that `trilat --help` stays fast.
 """
 
 import json
@@ -27,7 +27,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from ..errors import count_nouns
-from .untrusted_text import CONTROLS, MAX_LETTERS, escape_controls, sanitize
+from .untrusted_text import CONTROLS, MAX_LETTERS, sanitize
 
 if TYPE_CHECKING:
     from ..log import Log
@@ -36,55 +36,55 @@ if TYPE_CHECKING:
 
 
 class TextConsole(Console):
-    """Console of the library Rich in which control characters of texts are made visible.
+    """Rich console that makes control characters visible.
 
-    A text from another program thus cannot control the terminal, not even in a table.
+    This prevents output from other programs from controlling the terminal, even inside a table.
     """
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Converts a string to Rich's type of text, with control characters replaced by names.
+        """Converts a string to Rich text, replacing control characters with their names.
 
-        Rich, the library that prints to the terminal, calls this for every text.
+        Rich calls this for every string.
 
         Args:
-            text: The text.
+            text: The string.
             **options: Options of Rich.
         """
-        return super().render_str(escape_controls(text), **options)
+        return super().render_str(_escape_controls(text), **options)
 
 
 out = TextConsole(highlight=False)
 err = TextConsole(stderr=True, highlight=False)
 
 PATIENCE_S = 1.0
-"""Time until a progress bar appears, in s."""
+"""Time after which a progress bar appears, in s."""
 _REDRAW_PERIOD_S = 0.1
-"""Shortest time between two drawings of a progress bar, in s."""
+"""Minimum time between two updates of a progress bar, in s."""
 LINES_AFTER_S = 1.0
-"""Time until `progress_lines` names the current work, in s."""
+"""Time after which `progress_lines` names the current task, in s."""
 LINES_PERIOD_S = 10.0
 """Time between two lines of `progress_lines`, in s."""
 _MAX_DAMAGED = 3
-"""Largest number of damaged parts of a log that are listed."""
+"""Maximum number of damaged parts of a log to list."""
 _PIPE_WIDTH = 160
-"""Least width of tables, in characters, when the output is not a terminal."""
+"""Minimum width of tables, in characters, if the output is not a terminal."""
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
-    """Prints a text of unknown origin as a line, without harmful characters.
+    """Prints a string of unknown origin as one line, without harmful characters.
 
-    Control characters are made visible, and Rich's markup in the text is not interpreted.
+    Control characters are made visible, and Rich markup in the string is not interpreted.
 
     Args:
         text: The line.
         console: The console, for standard output or standard error.
-        head: Text before the line, which is not sanitized.
+        head: Text printed before the line, which is not sanitized.
     """
     console.print(head + sanitize(text, MAX_LETTERS), markup=False, soft_wrap=True)
 
 
 def print_note(text: object) -> None:
-    """Prints a remark for the user to standard error, where it does not mix with results.
+    """Prints a remark for the user to standard error, to keep it separate from results.
 
     Args:
         text: The remark.
@@ -93,9 +93,7 @@ def print_note(text: object) -> None:
 
 
 def print_error(text: object) -> None:
-    """Prints an error message to standard error, so that it does not mix with results.
-
-    Another program can then read the results from standard output.
+    """Prints an error message to standard error, to keep it separate from results.
 
     Args:
         text: The message.
@@ -104,22 +102,22 @@ def print_error(text: object) -> None:
 
 
 def print_marked(mark: str, text: object) -> None:
-    """Prints a mark, such as a green "ok" for a passed check, and a text in one line.
+    """Prints a mark, such as a green "ok" for a passed check, and a text on one line.
 
     Args:
-        mark: The mark, which may have colours in Rich's markup.
+        mark: The mark, which may contain colours in Rich markup.
         text: The text of the line. It is made safe for the terminal.
     """
     out.print(f"{mark} {escape(sanitize(text, MAX_LETTERS))}", soft_wrap=True)
 
 
 def print_texts(texts: Iterable[object]) -> None:
-    """Prints several texts of unknown origin, one per line, without harmful characters.
+    """Prints several strings of unknown origin, one per line, without harmful characters.
 
-    Control characters are shown by names, see `print_text`.
+    Control characters are made visible, see `print_text`.
 
     Args:
-        texts: The texts.
+        texts: The strings.
     """
     for text in texts:
         print_text(text)
@@ -135,10 +133,10 @@ def print_paths(paths: Iterable[Path]) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Prints a value as JSON to standard output, for other programs to read.
+    """Prints a value as JSON to standard output, for use by other programs.
 
     Args:
-        value: Plain values, also in lists and dictionaries.
+        value: Plain values, possibly nested in lists and dictionaries.
 
     Raises:
         ValueError: The value contains NaN or an infinite number.
@@ -148,19 +146,19 @@ def print_json(value: Any) -> None:
 
 
 def print_line(text: str) -> None:
-    """Prints a line without buffering, so that a program that reads the output need not wait.
+    """Prints a line without buffering, so that a program reading the output does not wait.
 
     Args:
         text: The line.
     """
-    sys.stdout.write(escape_controls(text) + "\n")
+    sys.stdout.write(_escape_controls(text) + "\n")
     sys.stdout.flush()
 
 
 def print_table(table: "TextTable") -> None:
-    """Prints a table that is as wide as the terminal permits.
+    """Prints a table, at most as wide as the terminal.
 
-    If the output is not a terminal, the table is at least `_PIPE_WIDTH` wide.
+    If the output is not a terminal, a width of at least `_PIPE_WIDTH` is available.
 
     Args:
         table: The table.
@@ -175,7 +173,7 @@ def print_table(table: "TextTable") -> None:
 def print_result(result: "Result", *, as_json: bool = False, brief: bool = False) -> None:
     """Prints the result of a command, as text for people or as JSON for programs.
 
-    All commands with results end with this call, so that their output is uniform.
+    All commands with results end with this call, which keeps their output uniform.
 
     Args:
         result: The result of a command.
@@ -200,12 +198,12 @@ def print_result(result: "Result", *, as_json: bool = False, brief: bool = False
 
 @contextmanager
 def lines_aside(aside: bool) -> Iterator[None]:
-    """Redirects standard output to standard error in a `with` statement, if requested.
+    """Context manager that redirects standard output to standard error, if requested.
 
-    A command with the option --json uses this, so that its standard output contains only JSON.
+    Commands with the option --json use this to ensure that standard output contains only JSON.
 
     Args:
-        aside: True to redirect the output. False to change nothing.
+        aside: True to redirect the output. False to do nothing.
     """
     with redirect_stdout(sys.stderr) if aside else nullcontext():
         yield
@@ -213,28 +211,28 @@ def lines_aside(aside: bool) -> Iterator[None]:
 
 @contextmanager
 def progress_lines(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Prints lines on stderr while a `with` statement runs for long.
+    """Context manager that prints progress lines to stderr if its block takes long.
 
-    The first line appears after `LINES_AFTER_S`, and names the work. Further lines follow every
-    `LINES_PERIOD_S`, with the elapsed time. A thread prints them, because some work cannot
-    report its progress.
+    The first line names the task and appears after `LINES_AFTER_S`. Further lines with the
+    elapsed time follow every `LINES_PERIOD_S`. They are printed from a thread, because some
+    tasks cannot report their progress.
 
     Args:
-        label: Phrase that names the work, such as "judging run.mcap".
+        label: Phrase that describes the task, such as "judging run.mcap".
 
     Yields:
-        A function that may be called with (done, total). The lines then state the percentage.
+        A function that may be called with (done, total). The lines then include the percentage.
     """
     has_ended = threading.Event()
     percent = ""
 
     def show(done: int, total: int) -> None:
-        """Stores the progress of a command, which the next printed line states."""
+        """Stores the progress of a command, to be included in the next printed line."""
         nonlocal percent
         percent = f"{100 * done // total} %, " if total > 0 else ""
 
     def print_lines() -> None:
-        """Prints lines with the progress at intervals, until the work ends."""
+        """Prints progress lines at intervals until the task ends."""
         if has_ended.wait(LINES_AFTER_S):
             return
         err.print(f"{label} ...", markup=False, soft_wrap=True)
@@ -254,14 +252,14 @@ def progress_lines(label: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function that draws a progress bar, for use in a `with` statement.
+    """Context manager that yields a function for updating a progress bar.
 
-    The function is called with (done, total), at any rate. The bar appears after `PATIENCE_S`,
-    and only on a terminal. If the output is not a terminal, `progress_lines` prints a few lines
-    instead.
+    The function is called with (done, total), as often as desired. The bar appears after
+    `PATIENCE_S`, and only on a terminal. If the output is not a terminal, `progress_lines`
+    prints a few lines instead.
 
     Args:
-        label: Phrase that names the work, such as "reading run.mcap".
+        label: Phrase that describes the task, such as "reading run.mcap".
     """
     if not err.is_interactive:
         with progress_lines(label) as show_lines:
@@ -290,10 +288,10 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     drawn_s = start_s
 
     def show(done: int, total: int) -> None:
-        """Draws the progress of a command, for example 12 of 50 runs.
+        """Updates the displayed progress of a command, for example to 12 of 50 runs.
 
-        The bar appears only if the command takes longer than `PATIENCE_S`. Updates that follow
-        each other too quickly are skipped, because they would slow down the work.
+        The bar appears only if the command takes longer than `PATIENCE_S`. Updates in quick
+        succession are skipped, because they would slow down the work.
 
         Args:
             done: Number of finished items.
@@ -316,7 +314,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
-    """Opens a log with a progress bar in the terminal, and warns of damaged parts.
+    """Opens a log with a progress bar in the terminal, and warns about damaged parts.
 
     Args:
         first: File of the log, or its first part.
@@ -324,7 +322,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
         **allowed: Further options of `open_log`.
 
     Raises:
-        LogError: A file is missing, is not an MCAP file, or is not a log of trilat-net.
+        LogError: A file is missing, is not an MCAP file, or is not a trilat-net log.
     """
     from ..log import open_log
 
@@ -335,7 +333,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 
 def warn_of_damage(log: "Log") -> None:
-    """Warns the user of damaged parts of a log, and names the command that saves the rest.
+    """Warns the user about damaged parts of a log, and names the command that saves the rest.
 
     Nothing is printed for an intact log.
 
@@ -356,16 +354,14 @@ def warn_of_damage(log: "Log") -> None:
 
 
 def warn_user_laws(log: "Log") -> None:
-    """Tells the user which user-written control laws will run when a log is executed again.
+    """Tells the user which user-written control laws will run when a log is re-executed.
 
-    The warning also names the laws that may not run because the user has not permitted them.
+    The warning also lists laws that cannot run because the user has not permitted them.
 
     Args:
         log: The log.
     """
-    from ..own_code import find_user_laws
-
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.inspect_user_laws():
         if law.allowed:
             print_note(f"executing this log runs code from outside: {law}")
         else:
@@ -373,7 +369,7 @@ def warn_user_laws(log: "Log") -> None:
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Tells the user if a log file was cut off, and which command recovers its contents.
+    """Warns the user if a log file is truncated, and names the command that recovers it.
 
     Nothing is printed for a complete file.
 
@@ -401,3 +397,15 @@ def warn_if_unfinished(path: Path) -> None:
             f"{path}: was not finished: its end and its index are missing; repair it with: "
             f"trilat log recover {path}"
         )
+
+
+def _escape_controls(text: str) -> str:
+    """Replaces control characters in a string with their names, as in <U+001B>.
+
+    Otherwise output from another program could control the terminal, for example by clearing
+    it.
+
+    Args:
+        text: The string.
+    """
+    return CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)

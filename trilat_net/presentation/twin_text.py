@@ -1,7 +1,7 @@
-"""Writes the sentences for users on repetitions of a run with small pushes (twins).
+"""Describes repetitions of a run with small pushes (twins) in sentences for users.
 
 `analysis.twins` measures whether the effects of the pushes grow, and returns names and numbers.
-For example, this module writes that every push dies away, and which push does so most slowly.
+This module writes, for example, that every push dies away, and which one does so most slowly.
 """
 
 import math
@@ -18,7 +18,7 @@ def _describe_growth(growth: TwinGrowth) -> str:
     """Returns a sentence that says whether small pushes of a run grow or die away.
 
     The sentence is about the push that grows most or dies away most slowly, or about a
-    departure from a position of rest. Without pushes it gives the reason.
+    departure from a rest position. If there were no pushes, it states the reason.
     """
     worst = growth.worst
     departure = growth.departure
@@ -62,7 +62,7 @@ def _describe_misses(growth: TwinGrowth) -> str:
 
 
 def describe_push(twins: PushedTwins, pushed: PushGrowth) -> str:
-    """Returns a sentence on whether the effect of one push grows or dies away.
+    """Returns a sentence that says whether the effect of a push grows or dies away.
 
     Args:
         twins: The run and its twins.
@@ -87,8 +87,8 @@ def describe_push(twins: PushedTwins, pushed: PushGrowth) -> str:
 def _describe_worst_push(twins: PushedTwins) -> str:
     """Returns a sentence on the worst push, which grows most or dies away most slowly.
 
-    If the user requested pushes of several sizes, the sentence states instead for which sizes
-    the effect is proportional to the size.
+    If the user requested pushes of several sizes, the sentence instead says for which sizes the
+    effect is proportional to the size.
     """
     if twins.linear is not None:
         return _describe_linear_sizes(twins)
@@ -120,4 +120,4 @@ DESCRIBERS: dict[type, Callable[[Any], str]] = {
     TwinGrowth: _describe_growth,
     PushedTwins: _describe_worst_push,
 }
-"""The functions that describe the findings of this module, by the class of the finding."""
+"""Functions that describe findings, keyed by the class of the finding."""

@@ -1,6 +1,6 @@
-"""Makes texts from files and from other computers safe to print.
+"""Makes strings from files and from other computers safe to print.
 
-Such a text could contain control characters that move the cursor or hide other texts.
+Such strings could contain control characters that move the cursor or hide other text.
 """
 
 import re
@@ -10,36 +10,25 @@ CONTROLS = re.compile(
 )
 """Characters that move the cursor, ring the bell, set colours, or change the text direction.
 
-Line feeds and tabs are not among them.
+Line feeds and tabs are not included.
 """
 HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
-"""Pattern of a hash in hexadecimal digits, or of the first 12 or more digits of a hash.
+"""Matches a hexadecimal hash, or at least the first 12 digits of one.
 
-A hash is kept on one line so that it can be copied.
+Hashes are kept on one line so that they can be copied.
 """
 MAX_LETTERS = 4000
-"""Largest length of a printed line."""
-
-
-def escape_controls(text: str) -> str:
-    """Replaces control characters of a text by their names, as in <U+001B>.
-
-    Otherwise a text from another program could control the terminal, for example clear it.
-
-    Args:
-        text: The text.
-    """
-    return CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)
+"""Maximum length of a printed line."""
 
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Replaces the harmful characters of a text of unknown origin, and truncates a long text.
+    """Replaces harmful characters in a string of unknown origin, and truncates long strings.
 
-    Control characters could otherwise control the terminal.
+    Without this, control characters could manipulate the terminal.
 
     Args:
-        text: The text, or an object that is converted to a string.
-        most: Largest number of characters.
+        text: The string, or an object that is converted to a string.
+        most: Maximum number of characters.
     """
     # One character more than the limit shows whether the text is too long.
     beginning = str(text)[: most + 1]

@@ -1,13 +1,12 @@
-"""Describes experiments as scenarios: reads them from files, completes them and checks them.
+"""Reads scenario files, fills in the default values and validates the result.
 
-A scenario describes one experiment: the robot arms, the control law of each arm, the network
-links between the arms with their delays, and the people or programs that move the arms. Its
-author writes it as a TOML file. The program converts it to typed objects that cannot be changed
-afterwards.
+A scenario is a TOML file that describes one experiment: the robot arms, the control law of each
+arm, the network links between them with their delays, and the people or programs that move the
+arms. It is converted to typed, immutable objects.
 
 Invariant:
-    - A scenario that loads also runs. Every mistake that a person can make is refused when the
-      scenario is loaded, with the path of the key and the nearest valid name.
+    - A scenario that loads also runs. Every mistake in a scenario is reported when the scenario
+      is loaded, with the path of the key and the nearest valid name.
 """
 
 from typing import TYPE_CHECKING
@@ -20,7 +19,6 @@ __all__ = [
     "SimulatedArm",
     "TracePoint",
     "check_outside_arms",
-    "embedded_names_reader",
     "import_trace",
     "list_shipped",
     "load_scenario",
@@ -31,7 +29,6 @@ __all__ = [
     "parse_embedded",
     "parse_scenario",
     "read_template",
-    "reseed_scenario",
     "split_assignment",
     # The parts of a scenario
     "BUILT_IN",
@@ -47,29 +44,19 @@ __all__ = [
     "is_distribution",
     "is_number",
     # Links and delays
-    "ConstantDelay",
     "LinkBase",
     "PictureDelay",
-    "draw_used_samples",
     # Operators and environments
     "FAILED_HAND",
     "POLICY",
-    "DeviceSettings",
     "HandPlayer",
     "HandSite",
-    "JointSpring",
     "LiveHand",
-    "Multisine",
     "OwnPlant",
     "PlantContext",
     "PlantPlayer",
-    "ViscousEnvironment",
-    "Wall",
-    "make_hand_players",
-    "make_plant_players",
     # Changes during a run
     "LinkTables",
-    "find_requester",
     "parse_core_change",
     "resolve_change",
     # Expectations
@@ -79,68 +66,45 @@ __all__ = [
     # Descriptions
     "IRREVERSIBLE_SHARES",
     "ScenarioDifference",
-    "compare_scenarios",
-    "describe_event",
     "describe_law",
-    "describe_law_conditions",
     "describe_scenario",
     "describe_value",
     "flatten_table",
     "list_arm_notes",
-    "list_law_situations",
 ]
 
 if TYPE_CHECKING:
     from .arms import TASK_AXES, ArmModel
-    from .change import Change, describe_event, find_requester
+    from .change import Change
     from .delay_models import LinkBase
-    from .delay_models.kernel_delays import ConstantDelay
     from .delay_traces import TracePoint, import_trace
     from .describe import (
         IRREVERSIBLE_SHARES,
         ScenarioDifference,
-        compare_scenarios,
         describe_law,
-        describe_law_conditions,
         describe_scenario,
         describe_value,
         flatten_table,
         list_arm_notes,
-        list_law_situations,
     )
     from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect
     from .key_checks import check_finite, is_distribution, is_number
     from .laws import BUILT_IN, LAWS
     from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-    from .operators.kernel_operators import (
-        DeviceSettings,
-        JointSpring,
-        LiveHand,
-        Multisine,
-        ViscousEnvironment,
-        Wall,
-    )
-    from .operators.program_hand import (
-        FAILED_HAND,
-        POLICY,
-        HandPlayer,
-        HandSite,
-        make_hand_players,
-    )
+    from .operators.kernel_operators import LiveHand
+    from .operators.program_hand import FAILED_HAND, POLICY, HandPlayer, HandSite
     from .override import split_assignment
     from .own_plant import OwnPlant
-    from .plant_player import PlantContext, PlantPlayer, make_plant_players
+    from .picture_delay import PictureDelay
+    from .plant_player import PlantContext, PlantPlayer
     from .run_changes import LinkTables, parse_core_change, resolve_change
-    from .sample_uses import PictureDelay, draw_used_samples
     from .scenario_reader import (
         ExperimentText,
-        embedded_names_reader,
         list_shipped,
         load_scenario,
         parse_embedded,
         parse_scenario,
         read_template,
-        reseed_scenario,
     )
     from .scenario_types import Scenario
     from .simulated_arm import SimulatedArm
@@ -152,33 +116,27 @@ else:
         __name__,
         {
             "arms": "ArmModel TASK_AXES",
-            "change": "Change describe_event find_requester",
+            "change": "Change",
             "delay_models": "LinkBase",
-            "delay_models.kernel_delays": "ConstantDelay",
             "delay_traces": "TracePoint import_trace",
             "describe": (
-                "IRREVERSIBLE_SHARES ScenarioDifference compare_scenarios describe_law "
-                "describe_law_conditions describe_scenario describe_value flatten_table "
-                "list_arm_notes list_law_situations"
+                "IRREVERSIBLE_SHARES ScenarioDifference describe_law describe_scenario "
+                "describe_value flatten_table list_arm_notes"
             ),
             "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect",
             "key_checks": "check_finite is_distribution is_number",
             "laws": "BUILT_IN LAWS",
             "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
-            "operators.kernel_operators": (
-                "DeviceSettings JointSpring LiveHand Multisine ViscousEnvironment Wall"
-            ),
-            "operators.program_hand": (
-                "FAILED_HAND HandPlayer HandSite POLICY make_hand_players"
-            ),
+            "operators.kernel_operators": "LiveHand",
+            "operators.program_hand": "FAILED_HAND HandPlayer HandSite POLICY",
             "override": "split_assignment",
             "own_plant": "OwnPlant",
-            "plant_player": "PlantContext PlantPlayer make_plant_players",
+            "picture_delay": "PictureDelay",
+            "plant_player": "PlantContext PlantPlayer",
             "run_changes": "LinkTables parse_core_change resolve_change",
-            "sample_uses": "PictureDelay draw_used_samples",
             "scenario_reader": (
-                "ExperimentText embedded_names_reader list_shipped load_scenario "
-                "parse_embedded parse_scenario read_template reseed_scenario"
+                "ExperimentText list_shipped load_scenario parse_embedded parse_scenario "
+                "read_template"
             ),
             "scenario_types": "Scenario",
             "simulated_arm": "SimulatedArm",

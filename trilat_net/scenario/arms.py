@@ -1,18 +1,16 @@
-"""Defines the arms of an experiment: the planar two-link arm, and chains from URDF files.
+"""Arms of an experiment: the planar two-link arm, and serial chains read from URDF files.
 
-`Arm` and `Task` are the tables in which the author of an experiment describes an arm.
-`build_arm` converts them to an `ArmModel` with the geometry and the dynamic parameters that
-computations need. From the model, `compute_rest_gains` derives the damping with which an arm is
-brought to rest, and `bound_estimates` the bounds for the parameters that an adaptive control
-law estimates.
+`Arm` and `Task` are the scenario tables that describe an arm. `build_arm` converts them to an
+`ArmModel`, which holds the geometry and the dynamic parameters. The model also computes the
+damping used to bring the arm to rest (`compute_rest_gains`) and the bounds on the parameters
+that an adaptive control law estimates (`bound_estimates`).
 
 Invariant:
-    - If one arm of a scenario is a chain, all arms are modelled as chains. The planar arm is
-      then a chain of two joints in the x-y plane. Therefore the same functions compute all
-      arms.
-    - Results are the same on every machine. The computation of eigenvalues differs between
-      machines in the last bits, so a time that follows from eigenvalues is rounded up to whole
-      milliseconds.
+    - If one arm of a scenario is a chain, all of its arms are modelled as chains, so the same
+      functions apply to each of them. The planar arm then becomes a chain of two joints in the
+      x-y plane.
+    - Results are identical on every machine. Eigenvalues differ between machines in the last
+      bits, so any time derived from eigenvalues is rounded up to whole milliseconds.
 """
 
 import math
@@ -50,68 +48,68 @@ from .urdf import UrdfChain, UrdfJoint, UrdfPayload, read_urdf
 TASK_AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task: three translations and three rotations."""
 STOP_REACH_RAD = 0.05
-"""Depth in a stop at which the stop pushes with the effort limit of the joint, in rad or m."""
+"""Depth of penetration at which a stop pushes with the joint's effort limit, in rad or m."""
 START_MARGIN_RAD = 0.15
 START_MARGIN_M = 0.02
-"""Largest distance of a start pose beyond a stop or a position limit.
+"""Largest permitted distance of a start pose beyond a stop or a position limit.
 
-The margin is 8.6 degrees, or 2 cm for a sliding joint. It is needed because encoders are set to
-zero by hand, and arms are parked on stops that lie beyond those in their URDF files.
+The margin is 8.6 degrees, or 2 cm for a prismatic joint. It is needed because encoders are
+zeroed by hand, and arms are parked on stops that lie beyond those in their URDF files.
 """
 STOP_EFFORT_NM = 100.0
-"""Effort limit from which the stiffness of a stop is computed if the file states none."""
+"""Effort limit for computing the stiffness of a stop if the file has none."""
 STOP_DAMPING_S = 0.01
 """Ratio of the damping of a stop to its stiffness, in s."""
 PLANAR_UNITS = ("kg m^2", "kg m^2", "kg m^2", "kg m", "kg m")
-"""Units of the five parameters of Eq. (24)."""
+"""Units of the five parameters in Eq. (24)."""
 BODY_UNITS = {
     "m": "kg",
     **dict.fromkeys(("mc_x", "mc_y", "mc_z"), "kg m"),
     **dict.fromkeys(("Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"), "kg m^2"),
 }
-"""Units of the ten inertial parameters of a link of a chain, by name.
+"""Mapping from name to unit of the ten inertial parameters of a link in a chain.
 
-m is the mass, mc the mass times the centre of mass, and I the inertia about the joint's frame.
+m is the mass, mc is the mass times the centre of mass, and I is the inertia about the origin of
+the joint frame.
 """
 _SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
-"""Units of a sliding joint, by the unit of the same quantity of a rotating joint."""
+"""Mapping from the unit of a quantity at a revolute joint to that at a prismatic joint."""
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Arm(fields.Frozen, frozen=True):
-    """Arm of a site, as the author of an experiment describes it in a scenario.
+    """Description of a site's arm in a scenario.
 
-    An arm is either the planar arm of two links, or a chain of joints from a URDF file. The
-    defaults of the planar arm are those of the paper, with point masses at the ends of the
-    links. Each key belongs to one of the two kinds of arm, or to both.
+    An arm is either the planar two-link arm or a serial chain read from a URDF file. Some keys
+    apply to only one of the two. The defaults for the planar arm are taken from the paper, with
+    point masses at the ends of the links.
 
     Attributes:
-        l1_m: This key and the following keys up to I2_kg_m2 are those of `ArmLinks`.
+        l1_m: See `ArmLinks` for this key and those that follow, up to I2_kg_m2.
         g_m_s2: Gravitational acceleration, in m/s^2.
         known: False if the masses and inertias are unknown, as for a robot that has not been
-            identified. They are then not used in any formula. Only for a real robot.
-        dead_man: True if the arm moves only while somebody holds its dead-man switch
-            (`docs/sessions/external-arm.md`). Only for a real robot.
-        urdf: Name of the URDF file of the arm, in `Scenario.urdf`. Empty for the planar arm.
-        base_xyz_m: Position of the base in the frame that all sites share, in m. Walls and
-            operators are described in this frame as well.
-        base_rpy_rad: Orientation of the base in that frame, in rad: rotations about the fixed
-            axes x, y and z, in this order.
-        base: Name of the link that does not move. By default, the root of the file.
-        tip: Name of the link at the end of the arm. By default, the only link that carries no
-            other link.
-        down: Direction of gravity in the frame of the base. Its length does not matter.
-        payload_kg: Mass that is fixed to the tip, in kg. If it is 0, the next two keys have no
-            effect.
-        payload_com_m: Centre of mass of the payload in the frame of the tip, in m.
+            identified. No formula uses them in that case. Real robots only.
+        dead_man: True if the arm moves only while its dead-man switch is held
+            (`docs/sessions/external-arm.md`). Real robots only.
+        urdf: Name of the arm's URDF file in `Scenario.urdf`. Empty for the planar arm.
+        base_xyz_m: Position of the base in the shared frame, in m. Walls and operators are also
+            described in that frame.
+        base_rpy_rad: Orientation of the base in the shared frame, in rad, as successive
+            rotations about the fixed axes x, y and z.
+        base: Name of the fixed link. By default, the root link of the file.
+        tip: Name of the link at the end of the arm. By default, the only leaf link of the file.
+        down: Direction of gravity in the base frame. Need not be normalised.
+        payload_kg: Mass attached to the tip, in kg. If 0, the next two keys have no effect.
+        payload_com_m: Centre of mass of the payload in the tip frame, in m.
         payload_inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz of the payload about its centre of
             mass.
-        armature_kg_m2: Inertia of each drive, reflected to its joint, in kg m^2, or in kg for a
-            prismatic joint.
-        stops: True if the joint limits of the file are mechanical stops, modelled as springs.
-        balance_inertia: True if an impossible inertia in the file is replaced by the nearest
-            possible one. False if it is refused.
-        links: Masses and inertias that replace those of the file, by the name of the link.
+        armature_kg_m2: Inertia of each drive reflected to its joint, in kg m^2 (kg for a
+            prismatic joint).
+        stops: True if the joint limits of the file are mechanical stops, which are modelled as
+            springs.
+        balance_inertia: If True, a physically impossible inertia in the file is replaced with
+            the nearest possible one. If False, it is rejected.
+        links: Mapping from link name to the mass and inertia that override those of the file.
     """
 
     l1_m: fields.Positive = 1.0
@@ -142,23 +140,22 @@ class Arm(fields.Frozen, frozen=True):
     def planar_links(self) -> ArmLinks:
         """Returns the lengths, masses and inertias of the two links of a planar arm.
 
-        They are meaningless if the arm is a chain from a URDF file.
+        The values are meaningless for an arm read from a URDF file.
         """
         values = {name: getattr(self, name) for name in ArmLinks._fields}
         return ArmLinks(**values)
 
     def read_chain(self, urdf_texts: Mapping[str, str]) -> UrdfChain:
-        """Reads the joints between the base and the tip of the arm from its URDF file.
+        """Parses the joints between the base and the tip of the arm from its URDF file.
 
-        URDF is the usual XML format for the links and joints of a robot. Nothing is read from
-        disk here: the texts of the files are an argument.
+        The file is taken from `urdf_texts`; nothing is read from disk.
 
         Args:
-            urdf_texts: Texts of the URDF files of the scenario, by name.
+            urdf_texts: Mapping from name to content of the scenario's URDF files.
 
         Raises:
-            ScenarioError: There is no such file, or it cannot be used. The error contains the
-                path of a key below that of the arm.
+            ScenarioError: The file is missing or cannot be used. The error contains a key path
+                relative to the arm.
         """
         if self.urdf not in urdf_texts:
             raise ScenarioError(f"{self.urdf!r} is not a file of the scenario", path="urdf")
@@ -188,36 +185,36 @@ class Arm(fields.Frozen, frozen=True):
 def start_margin(joint: ChainJoint) -> float:
     """Returns how far beyond its stops and position limits a joint may start, in rad or m.
 
-    A real arm at rest may stand slightly beyond the nominal position of a stop.
+    A real arm at rest can stand slightly beyond the nominal position of a stop.
 
     Args:
-        joint: A joint of a chain. A prismatic joint has a margin in m.
+        joint: A joint of a chain. For a prismatic joint, the margin is in m.
     """
     return START_MARGIN_M if joint.prismatic else START_MARGIN_RAD
 
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
-"""Keys of an arm that place its base in space."""
+"""Keys of an arm that specify the pose of its base."""
 CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
-"""Keys of an arm that only a chain has."""
+"""Keys of an arm that apply only to a chain."""
 
 
 class Task(fields.Frozen, frozen=True, omit_defaults=True):
-    """Coordinates in which the arms of a session follow each other.
+    """The coordinates in which the arms of a session follow each other.
 
-    They are joint angles, positions of the end effectors, or whole poses. Arms with different
-    numbers of joints can only follow each other's positions or poses.
+    The arms share joint angles, end effector positions or full end effector poses. Arms that
+    differ in their number of joints can only share positions or poses.
 
     Attributes:
-        space: "joints": The sites share joint angles. "position": They share the positions of
-            their end effectors. "pose": They share positions and orientations.
-        axes: Axes along which the site follows its peers, out of x, y, z, rx, ry and rz. By
-            default, all axes.
-        scale: Number of metres in the shared coordinates per metre of this arm.
-        posture_rad: Joint angles that the arm tends to in the directions that the task leaves
-            free. By default, its start pose.
-        posture_rate_1_s: Rate at which the arm returns to that posture, in 1/s.
-        singular_value: Singular value of the Jacobian below which its inverse is damped.
+        space: "joints" to share joint angles, "position" to share end effector positions, or
+            "pose" to share positions and orientations.
+        axes: Axes along which the site follows its peers, chosen from x, y, z, rx, ry and rz.
+            By default, all axes.
+        scale: Scale factor from this arm's coordinates to the shared coordinates, in m per m.
+        posture_rad: Posture to which the arm returns in the directions that the task leaves
+            free, in rad. By default, the start pose.
+        posture_rate_1_s: Rate of the return to that posture, in 1/s.
+        singular_value: Singular value of the Jacobian below which the inverse is damped.
     """
 
     space: Literal["joints", "position", "pose"] = "joints"
@@ -229,23 +226,23 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def shared(self) -> int:
-        """Number of coordinates of the end effector that arms send each other: 3 or 6.
+        """Number of shared end effector coordinates: 3 or 6, or 0 for joint angles.
 
-        These are 3 for a position and 6 for a pose. The number is 0 if they send joint angles
-        instead, because the number of joints depends on the arm.
+        A position has 3 coordinates and a pose has 6. For joint angles the value is 0, since
+        the number of joints depends on the arm.
         """
         return {"joints": 0, "position": 3, "pose": 6}[self.space]
 
     def find_idle_key(self, written: Mapping[str, object]) -> fields.KeyProblem | None:
-        """Returns a key that the author of a scenario wrote although it has no effect.
+        """Looks for a key that the author set although it has no effect.
 
-        Such a key is refused, because its author probably expected an effect.
+        Such a key is rejected, since its author probably expected it to do something.
 
         Args:
-            written: Table of the task as its author wrote it.
+            written: The task table as written by its author.
 
         Returns:
-            The key and the reason. None if every written key has an effect.
+            The key and the reason, or None if every key has an effect.
         """
         if not self.shared:
             for key in written:
@@ -268,11 +265,10 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def setup(self) -> TaskSetup | None:
-        """Settings of the shared coordinates, for the compiled control loop.
+        """Settings of the shared coordinates for the compiled control loop.
 
-        They state along which axes of the end effector the arms follow each other, and with
-        which scale and posture. The value is None if the arms follow each other's joint angles,
-        because no settings are needed then.
+        They specify the axes along which the end effectors follow each other, the scale and the
+        posture. None if the arms follow each other's joint angles, which needs no settings.
         """
         if not self.shared:
             return None
@@ -289,22 +285,23 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 class ArmModel(NamedTuple):
-    """Model of an arm with n joints, which computes positions, Jacobians and inertias.
+    """Model of an arm with n joints, used to compute positions, Jacobians and inertias.
 
-    `build_arm` creates it from the table of the arm in a scenario.
+    Created by `build_arm` from the arm's table in a scenario.
 
     Attributes:
-        theta: True inertial parameters: the five of Eq. (24) for the planar arm, ten per link
-            for a chain.
+        theta: True inertial parameters: the five parameters of Eq. (24) for the planar arm, or
+            ten per link for a chain.
         counts: Lengths of the arm's vectors.
-        joint_names: Names of the joints, starting at the base.
-        link_names: Names of the links that the joints move.
-        efforts: Largest effort of each joint according to the file, in N m or N. inf if the
-            file does not state it.
-        speeds: Largest speed of each joint according to the file, in rad/s or m/s. inf if the
-            file does not state it.
-        lengths_m: Lengths of the two links of the planar arm. (0, 0) for a chain.
-        chain: Chain as the record that the simulation kernel reads. None for the planar arm.
+        joint_names: Names of the joints, from the base to the tip.
+        link_names: Names of the links moved by the joints.
+        efforts: Effort limit of each joint from the file, in N m or N; inf if the file has
+            none.
+        speeds: Speed limit of each joint from the file, in rad/s or m/s; inf if the file has
+            none.
+        lengths_m: Lengths of the two links of the planar arm, in m; (0, 0) for a chain.
+        chain: The chain in the record format read by the simulation kernel; None for the planar
+            arm.
     """
 
     theta: Array
@@ -320,8 +317,8 @@ class ArmModel(NamedTuple):
     def parameters(self) -> list[tuple[str, str]]:
         """Label and unit of each inertial parameter, in the order of `theta`.
 
-        The planar arm has "theta_1", "theta_2" and so on. A chain names the link and the
-        quantity. Figures and messages use these labels.
+        Labels are "theta_1", "theta_2" and so on for the planar arm. For a chain, a label names
+        the link and the quantity. Figures and messages use these labels.
         """
         if self.chain is None:
             return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
@@ -331,11 +328,11 @@ class ArmModel(NamedTuple):
         return parameters
 
     def widen_stops(self, q0: Vector) -> "ArmModel":
-        """Returns the arm with stops moved outward, so that the start pose touches none.
+        """Returns a copy of the arm with its stops moved outward, clear of the start pose.
 
-        A stop is moved to the start pose if the joint starts beyond it by at most the margin,
-        see `start_margin`. An arm that stands at rest beyond the nominal position of a stop
-        does not touch the real stop, so the spring of the stop must not push.
+        If a joint starts beyond a stop by no more than `start_margin`, the stop is moved to the
+        start position. The real arm stands at rest there without touching its stop, so the
+        spring of the stop must not push.
 
         Args:
             q0: Start pose, in rad or m, shape (n,).
@@ -355,10 +352,10 @@ class ArmModel(NamedTuple):
     def joint_units(self, unit: str) -> list[str]:
         """Returns the unit of a quantity for each joint, for example ["rad", "m"].
 
-        A joint that slides (prismatic) has m in place of rad, and N in place of N m.
+        For a prismatic joint, rad is replaced with m and N m with N.
 
         Args:
-            unit: Unit of the quantity for a rotating joint, for example "rad/s".
+            unit: Unit of the quantity for a revolute joint, for example "rad/s".
         """
         if self.chain is None:
             return [unit] * self.counts.joints
@@ -368,13 +365,13 @@ class ArmModel(NamedTuple):
         ]
 
     def end_effector(self, q: Vector) -> list[float]:
-        """Returns the position of the end effector at the joint angles `q`, m.
+        """Returns the position of the end effector at the joint angles `q`, in m.
 
         Args:
-            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+            q: Joint positions in rad, or in m for a prismatic joint, shape (n,).
 
         Returns:
-            The coordinates: two for the planar arm, three for a chain.
+            Two coordinates for the planar arm, three for a chain.
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
@@ -402,10 +399,11 @@ class ArmModel(NamedTuple):
         """Returns the orientation of the end effector at the joint angles `q`.
 
         Args:
-            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+            q: Joint positions in rad, or in m for a prismatic joint, shape (n,).
 
         Returns:
-            A rotation vector, whose direction is the axis and whose length is the angle in rad.
+            Rotation vector, in rad: its direction is the rotation axis and its length the
+                angle.
         """
         if self.chain is None:
             return 0.0, 0.0, q[0] + q[1]
@@ -413,12 +411,12 @@ class ArmModel(NamedTuple):
 
     @property
     def reach(self) -> HandReach:
-        """Range of the distance of the end effector from the first joint.
+        """Range of distances between the end effector and the first joint, in m.
 
-        It is exact for the planar arm, and a bound for a chain. Each joint, and the end
-        effector, has a fixed distance from the previous joint, plus the travel of a sliding
-        joint. The largest distance is the sum of all of these. Without sliding joints, the
-        smallest distance is at least the longest link minus the sum of the other links.
+        Exact for the planar arm, a bound for a chain. The upper bound is the sum of the
+        distances between consecutive joints (including the end effector) and the travel of all
+        prismatic joints. Without prismatic joints, the lower bound is the length of the longest
+        link minus the sum of the others, or 0 if this is negative.
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
@@ -436,13 +434,13 @@ class ArmModel(NamedTuple):
         return HandReach(joints[0].origin_m, inner_m, outer_m)
 
     def find_joint_reach(self, limits: MotionLimits) -> HandReach:
-        """Returns the range in which each joint of the arm may move.
+        """Returns the range in which each joint of the arm may move, in rad or m.
 
-        The range is bounded by the mechanical stops of the arm and by the position limits of
-        the experiment. The narrower bound counts.
+        The range is the intersection of the mechanical stops of the arm and the position limits
+        of the site.
 
         Args:
-            limits: Position limits of the site that runs the arm.
+            limits: Motion limits of the site that runs the arm.
         """
         joints = self.counts.joints
         low = np.broadcast_to(np.array(limits.q_min, dtype=np.float64), joints)
@@ -454,27 +452,27 @@ class ArmModel(NamedTuple):
 
     @property
     def shares_pose(self) -> bool:
-        """True if the arms follow each other's end effectors, and not each other's joints."""
+        """True if the arms follow each other's end effectors instead of each other's joints."""
         return self.chain is not None and self.chain.task is not None
 
     @property
     def axes(self) -> tuple[float, ...]:
-        """Directions in which the end effector follows other arms: 1 for followed, 0 for free.
+        """Directions in which the end effector follows its peers: 1 for followed, 0 for free.
 
-        For example (1, 1, 0) for an end effector that follows in x and y, and is free in z.
-        Empty if the sites share joint angles.
+        For example, (1, 1, 0) for an end effector that follows in x and y but not in z. Empty
+        if the sites share joint angles.
         """
         task = None if self.chain is None else self.chain.task
         return () if task is None else task.axes
 
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
-        """Returns the coordinates that an arm sends to the others in the pose `q`.
+        """Returns the coordinates that the arm sends to its peers in the pose `q`.
 
-        These are the joint angles, or the position of the end effector multiplied by a scale.
-        If whole poses are sent, the orientation as a rotation vector in rad follows.
+        These are either the joint angles or the scaled position of the end effector, followed
+        by its orientation as a rotation vector in rad if the arms share full poses.
 
         Args:
-            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+            q: Joint positions in rad, or in m for a prismatic joint, shape (n,).
         """
         if self.chain is None or self.chain.task is None:
             return tuple(q)
@@ -484,13 +482,12 @@ class ArmModel(NamedTuple):
         return (*position.tolist(), *self.end_effector_orientation(q))
 
     def task_jacobian(self, q: Vector) -> Array:
-        """Returns the Jacobian J that converts joint velocities to task velocities: xd = J qd.
+        """Returns the Jacobian J that maps joint velocities to task velocities: xd = J qd.
 
-        Task coordinates describe the end effector, if the arms follow each other's end
-        effectors.
+        Task coordinates apply only if the arms follow each other's end effectors.
 
         Args:
-            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+            q: Joint positions in rad, or in m for a prismatic joint, shape (n,).
 
         Returns:
             The Jacobian, shape (m, n), where m is the number of task coordinates.
@@ -502,15 +499,15 @@ class ArmModel(NamedTuple):
         return task_J[: self.counts.shared]
 
     def largest_gravity(self, g_m_s2: float) -> tuple[float, ...]:
-        """Returns the largest torques that gravity can exert on the joints of the planar arm.
+        """Returns upper bounds on the gravity torques of the planar arm, in N m.
 
-        The values are upper bounds over all poses.
+        The bounds hold in every pose.
 
         Args:
             g_m_s2: Gravitational acceleration, in m/s^2.
 
         Returns:
-            One torque per joint, in N m. Empty for a chain.
+            One torque per joint. Empty for a chain.
         """
         if self.chain is not None:
             return ()
@@ -518,15 +515,13 @@ class ArmModel(NamedTuple):
         return upper_nm + lower_nm, lower_nm
 
     def inertia(self, q: Array) -> Array:
-        """Returns the inertia matrix M(q) of a chain, including its drives.
-
-        Multiplied by the joint accelerations, it gives the torques that accelerate the arm.
+        """Returns the joint-space inertia matrix M(q) of a chain, including its drives.
 
         Args:
-            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+            q: Joint positions in rad, or in m for a prismatic joint, shape (n,).
 
         Returns:
-            The symmetric matrix, shape (n, n), in kg m^2 for rotating joints.
+            Symmetric matrix of shape (n, n), in kg m^2 for revolute joints.
         """
         return self._dynamics.find_inertia(q)
 
@@ -539,22 +534,22 @@ class ArmModel(NamedTuple):
         *,
         known: bool,
     ) -> RestGains:
-        """Computes the gains with which an arm is brought to rest by damping.
+        """Computes the damping gains that bring the arm to rest.
 
-        M is the inertia matrix of the arm. The joint i gets the damping B = M_ii / T, where T
-        is a time constant. Because the joints are coupled, the fastest motion of the arm
-        decays with the rate lambda / T, where lambda is the largest eigenvalue of diag(M) M^-1.
-        T is chosen so that the time constant T / lambda of this motion is at least
-        `BRAKE_TICKS` ticks. If the inertia of the arm is not known, B is the damping of the
-        control law, for joints for which it is positive.
+        Joint i is damped with B = M_ii / T, where M is the inertia matrix of the arm and T is a
+        time constant. Since the joints are coupled, the fastest motion decays at the rate
+        lambda / T, where lambda is the largest eigenvalue of diag(M) M^-1. T is chosen so that
+        the time constant T / lambda of this motion is at least `BRAKE_TICKS` ticks. If the
+        inertia is unknown, B is the damping of the control law, for the joints where that
+        damping is positive.
 
         Args:
-            q0: Start pose, for which the inertia of a chain is computed. The inertia of the
-                planar arm is that of the stretched pose.
-            law_damping: Damping of the control law for each joint, in N m s/rad, shape (n,).
-            limit_nm: Largest torque, in N m, as one number or one per joint.
+            q0: Start pose at which the inertia of a chain is evaluated. For the planar arm, the
+                inertia in the stretched pose is used instead.
+            law_damping: Damping of the control law at each joint, in N m s/rad, shape (n,).
+            limit_nm: Torque limit, in N m: a scalar, or one value per joint.
             rate_hz: Tick rate of the site, in Hz.
-            known: False if the parameters of the model are not those of the arm.
+            known: False if the inertial parameters of the arm are unknown.
         """
         if self.chain is None:
             a, b, c = self.theta[:3].tolist()
@@ -579,9 +574,9 @@ class ArmModel(NamedTuple):
         return RestGains(tuple(damping.tolist()), time_s, tuple(deceleration.tolist()))
 
     def bound_estimates(self, gains: Gains, limit_nm: Vector, g_m_s2: float) -> Gains:
-        """Adds bounds to the gains of an adaptive control law, for the parameters it estimates.
+        """Bounds the parameters that an adaptive control law estimates.
 
-        The motors must be able to hold the arm against gravity, which bounds the parameters.
+        The bounds follow from the assumption that the motors can hold the arm against gravity.
         Let T be the largest torque of a joint, g the gravitational acceleration, and l the
         length of a link (for a chain, the reach of the arm):
 
@@ -590,13 +585,13 @@ class ArmModel(NamedTuple):
         - the mass of a link is at most T / g divided by the mean length of the links;
         - masses, and second moments about an axis, are not negative.
 
-        The bounds are widened so that they include the first estimate. Gains that have bounds
-        already, and gains of other laws, are returned unchanged.
+        The bounds are widened to include the initial estimate. Gains that already have bounds,
+        and gains of other laws, are returned unchanged.
 
         Args:
-            gains: Gains of the control law, with the first estimate of the parameters.
-            limit_nm: Largest torque, in N m, as one number or one per joint.
-            g_m_s2: Gravitational acceleration, in m/s^2. Without gravity, no bounds are added.
+            gains: Gains of the control law, including the initial parameter estimate.
+            limit_nm: Torque limit, in N m: a scalar, or one value per joint.
+            g_m_s2: Gravitational acceleration, in m/s^2. If 0, no bounds are added.
         """
         has_box = np.isfinite(gains.low).any()
         if gains.law is not Law.ADAPTIVE or has_box or g_m_s2 == 0.0:
@@ -613,22 +608,22 @@ class ArmModel(NamedTuple):
 
 
 def _is_positive_definite(theta: Array) -> bool:
-    """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
+    """Returns True if the inertia matrix of the planar arm is positive definite in every pose.
 
-    Otherwise the parameters describe no real arm. With the angle q2 of the second joint, the
-    inertia matrix is
+    Otherwise, the parameters do not describe a real arm. With the angle q2 of the second joint,
+    the inertia matrix is
 
         M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
             | theta_3 + theta_2 cos(q2)      theta_3                   |
 
         det M = theta_1 theta_3 - theta_3^2 - theta_2^2 cos(q2)^2
 
-    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked. The
-    check has a margin for rounding.
+    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked,
+    with a margin for rounding errors.
 
     Args:
-        theta: Dynamic parameters of the arm, shape (5,), see `ArmLinks.theta`. The first
-            three are inertias, kg m^2.
+        theta: Dynamic parameters of the arm, shape (5,) (see `ArmLinks.theta`). The first three
+            are inertias, in kg m^2.
     """
     theta_1 = theta[0]
     theta_2 = theta[1]
@@ -639,18 +634,19 @@ def _is_positive_definite(theta: Array) -> bool:
 
 
 def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool) -> ArmModel:
-    """Builds the model of an arm from its table in a scenario, to compute its dynamics.
+    """Builds the dynamic model of an arm from its table in a scenario.
 
     Args:
-        arm: Table of the arm, with its lengths and masses or the name of its URDF file.
-        task: Coordinates that the site of the arm shares with other sites.
-        urdf_texts: Texts of the URDF files of the scenario, by name.
-        chains: True if all arms of the scenario are computed as chains of joints in space,
-            including the planar arm.
+        arm: Table that contains the lengths and masses of the arm, or the name of its URDF
+            file.
+        task: Coordinates that the arm shares with its peers.
+        urdf_texts: Mapping from name to content of the scenario's URDF files.
+        chains: If True, the arm is modelled as a spatial chain even if it is planar. Must be
+            the same for all arms of a scenario.
 
     Raises:
-        ScenarioError: The file of the arm cannot be used, or the planar arm has a singular
-            inertia matrix. The error contains the path of a key below that of the arm.
+        ScenarioError: The URDF file cannot be used, or the inertia matrix of the planar arm is
+            singular. The error contains a key path relative to the arm.
     """
     if arm.urdf:
         return _build_chain_model(arm, task, arm.read_chain(urdf_texts))
@@ -681,11 +677,11 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
 
 
 def _list_planar_bodies(arm: Arm) -> Array:
-    """Returns the planar arm's inertial parameters as those of a chain, shape (20,).
+    """Converts the planar arm's inertial parameters to those of a chain, shape (20,).
 
-    A link has the mass m, its centre of mass at (c, 0, 0), and the moment of inertia I about
-    the z axis through the centre of mass. About its joint, the first moment along x is m c, and
-    Iyy = Izz = m c^2 + I.
+    A link has mass m, centre of mass (c, 0, 0), and moment of inertia I about the z axis
+    through the centre of mass. About its joint, the first moment along x is m c, and Iyy = Izz
+    = m c^2 + I.
     """
     links = (
         (arm.m1_kg, arm.lc1_m, arm.I1_kg_m2),
@@ -699,10 +695,10 @@ def _list_planar_bodies(arm: Arm) -> Array:
 
 
 def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
-    """Returns the planar arm of two links as a general chain of joints.
+    """Converts the planar two-link arm to a general chain of joints.
 
-    The planar arm can then be simulated together with arms from URDF files. Its joints rotate
-    about z, and gravity acts along -y.
+    This allows the planar arm to be simulated together with arms from URDF files. Its joints
+    rotate about z, and gravity acts along -y.
     """
     shoulder = ChainJoint(
         prismatic=False, axis=(0.0, 0.0, 1.0), rotation=_IDENTITY, origin_m=(0.0, 0.0, 0.0)
@@ -713,9 +709,9 @@ def _build_planar_chain(arm: Arm, task: Task) -> ChainSetup:
 
 
 _KEYS_OF_SUBJECTS = {"base": "base", "tip": "tip", "payload": "payload_inertia_kg_m2"}
-"""Key of the arm for each subject of an error message of `read_urdf`.
+"""Mapping from the subject of a `read_urdf` error to the corresponding key of the arm.
 
-Errors with another subject concern the file.
+Errors about any other subject are errors of the file itself.
 """
 
 
@@ -729,9 +725,9 @@ def _read_cached(
     *,
     balance: bool,
 ) -> UrdfChain:
-    """Reads the chain of joints in a URDF file, see `read_urdf`.
+    """Parses the chain of joints in a URDF file (see `read_urdf`).
 
-    The result is cached, so the same file is not read again.
+    The result is cached, so the same file is parsed only once.
     """
     return read_urdf(
         text=text,
@@ -746,15 +742,15 @@ def _read_cached(
 def _place_base(
     arm: Arm, joints: tuple[ChainJoint, ...], gravity: Three
 ) -> tuple[tuple[ChainJoint, ...], Three]:
-    """Expresses the joints of an arm, and gravity, in a frame that is common to all arms.
+    """Transforms the joints of an arm, and gravity, to the frame shared by all arms.
 
     The rotation of the base is R_z(yaw) R_y(pitch) R_x(roll). Only the first joint changes,
-    because the other joints are expressed in the frame of the joint before them.
+    since each of the others is expressed in the frame of the preceding joint.
 
     Args:
         arm: Table of the arm.
-        joints: Joints in the frame of the base.
-        gravity: Gravitational acceleration in the frame of the base.
+        joints: Joints in the base frame.
+        gravity: Gravitational acceleration in the base frame.
     """
     if not (any(arm.base_xyz_m) or any(arm.base_rpy_rad)):
         return joints, gravity
@@ -772,7 +768,7 @@ def _place_base(
 
 
 def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
-    """Builds the model of an arm from the joints that were read from its URDF file.
+    """Builds the model of an arm from the joints in its URDF file.
 
     Raises:
         ScenarioError: The number of drive inertias differs from the number of joints.
@@ -811,7 +807,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
 
 
 def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) -> ChainJoint:
-    """Converts a joint of a URDF file to the format that the compiled simulation reads.
+    """Converts a joint from a URDF file to the format read by the compiled simulation.
 
     The ends of the joint's range become stops: a spring that pushes with the effort limit of
     the joint at the depth `STOP_REACH_RAD`, and a damper with `STOP_DAMPING_S` times the
@@ -820,7 +816,7 @@ def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) ->
     Args:
         joint: Joint from the file.
         armature_kg_m2: Inertia of the drive.
-        has_stops: Whether the joint limits of the file are stops.
+        has_stops: True if the joint limits of the file are stops.
     """
     chain_joint = ChainJoint(
         prismatic=joint.kind == "prismatic",
@@ -844,22 +840,22 @@ def _build_joint(joint: UrdfJoint, armature_kg_m2: float, *, has_stops: bool) ->
 
 
 BRAKE_S = 0.03
-"""Smallest time constant with which damping brings a joint to rest, in s."""
+"""Smallest time constant for damping a joint to rest, in s."""
 BRAKE_TICKS = 4
-"""Smallest time constant that the damping may give to any motion of the arm, in ticks."""
+"""Smallest time constant of any motion of the arm under damping, in ticks."""
 UNKNOWN_BRAKE_S = 0.1
-"""Time constant for an arm whose inertia is not known, in s."""
+"""Time constant used for an arm with unknown inertia, in s."""
 BRAKE_TORQUE_SHARE = 0.5
-"""Fraction of the largest torque that is used to decelerate the reference."""
+"""Fraction of the torque limit used to decelerate the reference."""
 
 
 def _bound_planar_parameters(
     arm: ArmModel, limit_nm: Vector, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the planar arm's five parameters, shape (5,) each.
+    """Returns lower and upper bounds on the planar arm's five parameters, shape (5,) each.
 
-    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
-    Eq. (24) defines the parameters.
+    They follow from the torque needed to hold the arm (see `bound_estimates`). The parameters
+    are those of Eq. (24).
     """
     T_1, T_2 = np.broadcast_to(limit_nm, 2)
     outer = min(T_1, T_2) / g_m_s2
@@ -873,9 +869,9 @@ def _bound_planar_parameters(
 def _bound_chain_parameters(
     arm: ArmModel, chain: ChainSetup, limit_nm: float, g_m_s2: float
 ) -> tuple[Array, Array]:
-    """Returns lower and upper bounds of the ten parameters of each link, shape (10 n,) each.
+    """Returns lower and upper bounds on the ten parameters of each link, shape (10 n,) each.
 
-    They follow from the torque of the motors, which can hold the arm, see `bound_estimates`.
+    They follow from the torque needed to hold the arm (see `bound_estimates`).
     """
     joints = arm.counts.joints
     reach_m = sum(float(np.linalg.norm(joint.origin_m)) for joint in chain.joints)

@@ -1,12 +1,11 @@
-"""Defines a change of a running experiment, such as a new delay, and describes it to people.
+"""Changes made to a running experiment, such as a new delay, and their descriptions.
 
-Since old versions of the program stored the settings of a change in place of a sentence, old
-logs would show JSON to people. `describe_event` composes the missing sentence, so that old and
-new logs read alike.
+Early versions of the program logged a change only as JSON. `Change.describe_event` turns that
+JSON into the sentence that newer versions log.
 
 Invariant:
-    - A change contains the time from which it holds, and the complete settings after it, so
-      that it can be understood without the earlier changes.
+    - A change contains the time from which it applies and all settings that result from it, so
+      it can be understood without the earlier changes.
 """
 
 import re
@@ -28,50 +27,50 @@ _ORDER_SENTENCES = {
     "arm_back": "measurements came again from the arm of {site} at {at}",
     "overrun": "{site} missed {ticks} {noun} before {at}",
 }
-"""Sentence that describes each command to people."""
+"""Mapping from command to the sentence that describes it."""
 
 
 class Change(RecordedChange, frozen=True, omit_defaults=True):
-    """Change of a network link or of weights during a run, or a command to one arm's process.
+    """Change of a network link or of dominance factors during a run, or a command to a site.
 
-    The weights (dominance factors) state how much an arm follows the others. A scenario plans
-    changes, and users request further ones. Exactly one of `link`, `dominance` and `site` is
-    not empty, and says what is changed. Commands (`site`) occur only in the log of a run.
+    Changes are either planned in the scenario or requested by a user during the run. Exactly
+    one of `link`, `dominance` and `site` is non-empty and identifies what is changed. Commands
+    (`site`) occur only in logs.
     """
 
     @property
     def start_ns(self) -> int:
         """Time at which the change takes effect, in ns after the common start of the session.
 
-        Times of the simulation are integers, so they are the same on every machine.
+        An integer, as are all simulation times, to give identical results on every machine.
         """
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """All settings of a network link after this change, including those that stay the same.
+        """All settings of the network link after this change, including unchanged ones.
 
-        Only a change of a link has this property.
+        Only defined for a change of a link.
         """
         return msgspec.convert(self.to, Link)
 
     @property
     def owner(self) -> str:
-        """Name of the site, the process of an arm, that must carry out the change.
+        """Name of the site that carries out the change.
 
-        The receiver of a network link carries out a change of this link. Any other change names
-        its site.
+        A change of a link is carried out by the receiver of that link. All other changes name
+        their site.
         """
         return self.site or self.dominance or self.link.partition("->")[2]
 
     def describe(self, ordered_by: str = "") -> str:
-        """Describes the change in a phrase for people.
+        """Returns a human-readable phrase that describes the change.
 
-        An example is "m2 was stopped by the experimenter at 58.2 s", without a full stop.
+        An example is "m2 was stopped by the experimenter at 58.2 s", with no full stop.
 
         Args:
-            ordered_by: Who requested the change, as a noun phrase. Empty if the requester is
-                not known.
+            ordered_by: Noun phrase for the person or program that requested the change. Empty
+                if unknown.
         """
         by = f" by {ordered_by}" if ordered_by else ""
         if self.order:
@@ -92,35 +91,35 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
         target = shares or "nobody"
         return f"the shares of {self.dominance} were set to {target}{ramp}{by}, from {at} on"
 
+    @staticmethod
+    def find_requester(sentence: str) -> str:
+        """Extracts from a logged sentence who requested a stop.
 
-def find_requester(sentence: str) -> str:
-    """Returns who requested a stop, from the sentence about it in a log, for a report.
+        Args:
+            sentence: A sentence that `describe` returned.
 
-    Args:
-        sentence: Sentence that `Change.describe` returned.
+        Returns:
+            Noun phrase for the requester. Empty if the sentence does not describe a stop or
+            does not name a requester.
+        """
+        match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
+        return "" if match is None else match[1]
 
-    Returns:
-        The requester as a noun phrase. Empty if the sentence is not about a stop, or does not
-        say who requested it.
-    """
-    match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
-    return "" if match is None else match[1]
+    @classmethod
+    def describe_event(cls, kind: str, text: str, command: str) -> str:
+        """Returns a human-readable sentence that describes an event of a log.
 
+        Older versions of the program logged a change as JSON instead of a sentence; for such an
+        event, the sentence is built from the JSON. Otherwise `text` is returned unchanged.
 
-def describe_event(kind: str, text: str, command: str) -> str:
-    """Returns the sentence that describes an event of a log to people.
-
-    Older versions of the program logged the JSON text of a change in place of a sentence. For
-    such an event, the sentence is composed here, so that old and new logs read alike. All other
-    texts are returned unchanged.
-
-    Args:
-        kind: Kind of the event, a short name for programs.
-        text: Text of the event, as a site or a recorder published it.
-        command: JSON text of the change that the event reports. Empty for other events.
-    """
-    if kind == "change" and command and command in text:
-        # The command of an untrusted log may lack the keys of a change. The text is then kept.
-        with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
-            return msgspec.json.decode(command, type=Change).describe()
-    return text
+        Args:
+            kind: Machine-readable kind of the event.
+            text: Event message, as published by a site or recorder.
+            command: The reported change as JSON. Empty for other events.
+        """
+        if kind == "change" and command and command in text:
+            # The command of an untrusted log may lack the keys of a change. The text is then
+            # kept.
+            with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
+                return msgspec.json.decode(command, type=cls).describe()
+        return text

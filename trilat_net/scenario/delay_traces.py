@@ -1,25 +1,25 @@
-"""Reads delay traces: tables of send times and the delay that each message had.
+"""Reads delay traces: tables of the send time and the delay of each message.
 
-A link of the model "trace" repeats the delays of a trace. The table is a CSV file such as
+A link with the delay model "trace" replays the delays of a trace. A trace is read from a CSV
+file such as
 
     t_s,delay_ms
     0.000,41.2
     0.001,lost
 
-or it is taken from the log of a run. `import_trace` builds such a table from the output of
-`irtt` or `ping`, programs that measure the delay of a network. A resolved scenario contains the
-trace as a string, see `format_trace`.
+or from the log of a run. `import_trace` creates a trace from the output of network measurement
+programs such as `irtt` or `ping`. A resolved scenario contains the trace as a string (see
+`format_trace`).
 
 Invariant:
-    - A resolved scenario does not need the file any more.
-    - Times count from the first point of the trace, and in a measurement from the first sent
-      message. Times and delays are whole microseconds.
-    - A message without an answer is lost. A message whose delay exceeds the longest permitted
-      delay of a link also counts as lost.
-    - The delay in one direction is taken as half of the round trip, unless it was measured and
-      the caller requests it.
-    - Published measurements of other people are not part of the package. The user names their
-      files.
+    - A resolved scenario no longer needs the file.
+    - Times are relative to the first point of the trace or, for a measurement, to the first
+      message sent. Times and delays are integers in microseconds.
+    - A message with no reply is lost. A message also counts as lost if its delay exceeds the
+      longest permitted delay of a link.
+    - The one-way delay is half the round-trip time, unless one-way delays were measured and the
+      caller asks for them.
+    - The package contains no published measurements by third parties. Users supply the files.
 """
 
 import csv
@@ -44,13 +44,13 @@ from ..results import Result
 from .ping_output import read_ping
 
 MAX_TRACE_POINTS = 200_000
-"""Largest number of points of a trace: 200 s of a log at 1 kHz."""
+"""Maximum number of points of a trace, equivalent to 200 s of a log at 1 kHz."""
 
 _LOST = "lost"
 LONGEST_MS = MAX_DELAY_US / 1e3
 """Longest delay that a link may have, in ms."""
 TracePoint = tuple[float, float]
-"""Send time of a message in s, and its delay in ms. The delay of a lost message is infinite."""
+"""Send time of a message in s, and its delay in ms (infinite for a lost message)."""
 
 
 _OTHER_KINDS = {
@@ -60,7 +60,7 @@ _OTHER_KINDS = {
     b"%PDF": "a PDF document",
     b"SQLite": "an SQLite database",
 }
-"""Kinds of files that are not text, by their first bytes."""
+"""Kinds of files that are not text, identified by their leading bytes."""
 
 
 _ZIPPED_KINDS = {
@@ -69,20 +69,19 @@ _ZIPPED_KINDS = {
     b"Index/Tables": "a spreadsheet (.numbers)",
     b"word/document": "a text document (.docx)",
 }
-"""Kinds of documents in ZIP archives, by a text that the archive contains uncompressed."""
+"""Kinds of documents in ZIP archives, identified by an uncompressed string in the archive."""
 
 
 def _decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
-    """Decodes the bytes of a text file, and refuses files that are not text.
+    """Decodes the bytes of a text file, and raises ValueError if the file is not text.
 
-    The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it. The first bytes of the
-    file, such as a byte order mark, show which of the two it is.
+    The encoding is UTF-8, or UTF-16 as written by Windows PowerShell. It is detected from the
+    first bytes of the file, such as a byte order mark.
 
     Args:
         raw: Content of the file.
-        any_code_page: True to decode a text in another encoding as Latin-1, because programs on
-            Windows print in the code page of the user's country. Letters beyond ASCII may then
-            be wrong.
+        any_code_page: True to decode any other encoding as Latin-1, since Windows programs
+            print in the code page of the user's country. Non-ASCII letters may then be wrong.
 
     Returns:
         The text, without a byte order mark.
@@ -116,20 +115,19 @@ def _decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
 
 
 def _describe_kind(kind: str) -> str:
-    """Explains to the user that a file is not text, and how to get a text file from it.
+    """Explains to the user that a file is not text, and how to obtain a text file from it.
 
     Args:
-        kind: The kind of file, with its article, as in "a PDF document".
+        kind: Kind of file, including the article, as in "a PDF document".
     """
     advice = "save the sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
     return f"is {kind}, not text: {advice}"
 
 
 def _read_csv(path: Path) -> list[TracePoint]:
-    """Reads a delay trace, a table of sending times and delays, from a CSV file.
+    """Reads a delay trace from a CSV file with the columns `t_s,delay_ms`.
 
-    The columns are `t_s,delay_ms`. A header line is optional. Empty lines, and lines that start
-    with "#", are ignored.
+    The header is optional. Empty lines and lines that start with "#" are ignored.
 
     Raises:
         ValueError: A line does not contain a time and a delay.
@@ -166,19 +164,17 @@ def _is_number(cell: str) -> bool:
 
 
 def read_trace(path: Path, link: str) -> str:
-    """Reads a delay trace from a CSV file, or from the log of a run.
-
-    A trace of a real network lets a simulation repeat its delays.
+    """Reads a delay trace from a CSV file or from the log of a run.
 
     Args:
         path: CSV file with the columns `t_s,delay_ms`, or a log.
-        link: Name of the link whose delays are taken from a log, for example "m1->s".
+        link: Name of the link whose delays are read from a log, for example "m1->s".
 
     Returns:
-        The trace as text in the format of `format_trace`.
+        The trace as a string in the format of `format_trace`.
 
     Raises:
-        ScenarioError: The file cannot be read, or contains no trace.
+        ScenarioError: The file cannot be read or contains no trace.
     """
     try:
         if path.suffix != ".mcap":
@@ -193,19 +189,18 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns recorded delays as text, which becomes part of a scenario.
+    """Formats a delay trace as a string, to be stored in a scenario.
 
-    The recording is a table of sending times and delays. The format of the text is "t_us
-    delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the delay of a lost
-    message. Times count from the first point.
+    The format is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of
+    the delay of a lost message. Times are relative to the first point.
 
     Args:
-        points: Send time in s and delay in ms of each message. A lost message has an infinite
-            delay.
+        points: Send time in s and delay in ms of each message. The delay of a lost message is
+            infinite.
 
     Raises:
-        ValueError: There are no points or too many, a number is out of range, or the times do
-            not increase.
+        ValueError: There are no points or too many, a number is out of range, or the times are
+            not increasing.
     """
     if not points:
         raise ValueError("has no points")
@@ -243,20 +238,19 @@ def format_trace(points: Sequence[TracePoint]) -> str:
 
 @lru_cache(maxsize=64)
 def parse_trace(text: str) -> Points:
-    """Converts a delay trace from text to an array.
+    """Parses the string form of a delay trace into an array.
 
-    A delay trace is a table of send times and the delay that each message had. The result is
-    cached, because the trace of a link is needed many times.
+    The result is cached, since the trace of a link is needed many times.
 
     Args:
-        text: Trace as a string that `format_trace` returned.
+        text: A string returned by `format_trace`.
 
     Returns:
-        Read-only array of times and delays in microseconds, shape (n, 2). A lost message has
-        the delay `LOST`, see `core.vectors.Points`.
+        Read-only array of times and delays in microseconds, shape (n, 2). The delay of a lost
+        message is `LOST` (see `core.vectors.Points`).
 
     Raises:
-        ValueError: The text does not have this format, or a number is out of range.
+        ValueError: The string is malformed, or a number is out of range.
     """
     pairs = []
     for part in text.split(", "):
@@ -284,39 +278,38 @@ def parse_trace(text: str) -> Points:
 
 
 WAYS = ("half", "send", "receive", "whole")
-"""How the delay of a link is computed from a measured delay.
+"""How the one-way delay of a link is computed from a measurement.
 
-"half": Half of the round trip. "send", "receive": Delay in one direction, which only `irtt`
-measures. "whole": The measured number itself.
+"half": half of the round trip. "send", "receive": the one-way delay, which only `irtt`
+measures. "whole": the measured value itself.
 """
 _MAX_BYTES = 2**30
-"""Largest number of bytes that are read from a file."""
+"""Maximum number of bytes read from a file."""
 _COLUMN = re.compile(r"(?P<name>.+?)(?:[_ ](?P<suffix>s|ms|us|ns)|\((?P<unit>s|ms|us|ns)\))?$")
-"""Matches the head of a column with its unit, for example "rtt_ms" or "delay(ms)"."""
+"""Matches a column heading with its unit, for example "rtt_ms" or "delay(ms)"."""
 _GZIP_MAGIC = b"\x1f\x8b"
 """First two bytes of a gzip file."""
 _UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO_ANSWER_TEXTS = ("lost", "-1", "", "nan", "inf")
-"""Texts that stand in place of the delay of a lost message in tables."""
+"""Strings used in tables in place of the delay of a lost message."""
 _TIME_NAMES = ("t", "time", "timestamp", "pub_time")
 _DELAY_NAMES = ("delay", "rtt", "latency")
 
 
 @dataclass(frozen=True, repr=False)
 class MeasuredTrace(Result):
-    """Delays of a real network, imported from the output of a measuring program.
+    """Delays of a real network, imported from the output of a measurement program.
 
-    `import_trace` returns them. A simulated network link can then repeat the same delays.
+    Returned by `import_trace`. A simulated network link can replay these delays.
 
     Attributes:
-        points: Send time of each message since the first one in s, and its delay in ms. The
-            delay of a lost message is infinite.
-        too_long: Number of messages that count as lost because their delays exceed the longest
-            delay of a link.
-        doubled: Number of messages that were left out because another message has the same send
-            time.
-        cut: Number of messages that were left out at the end, because a trace has at most
-            `MAX_TRACE_POINTS` points.
+        points: Send time in s (relative to the first message) and delay in ms of each message.
+            The delay of a lost message is infinite.
+        too_long: Number of messages counted as lost because their delay exceeds the longest
+            permitted delay of a link.
+        doubled: Number of messages dropped because another message has the same send time.
+        cut: Number of messages cut off at the end, since a trace has at most `MAX_TRACE_POINTS`
+            points.
         begin_known: False if messages before the first point may be missing from the file.
         end_known: False if messages after the last point may be missing from the file.
     """
@@ -330,18 +323,15 @@ class MeasuredTrace(Result):
 
     @property
     def delay_ms(self) -> Array:
-        """Delays of all messages that were not lost, in ms, in the order of sending.
-
-        Statistics of the measured network are computed from them.
-        """
+        """Delays of all messages that were not lost, in ms, in the order of sending."""
         return np.array([ms for _, ms in self.points if math.isfinite(ms)])
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns statistics of the trace as plain values, ready for JSON.
+        """Returns summary statistics of the trace as JSON-compatible values.
 
         The keys are those of `trilat trace import --json`. The statistics of the delays are
-        left out if all messages were lost. The correlation is that between the delays of
-        consecutive messages (the lag-one autocorrelation). It is 0 if all delays are equal.
+        omitted if all messages were lost. The correlation is the lag-one autocorrelation of the
+        delays, or 0 if all delays are equal.
         """
         is_lost = np.array([math.isinf(ms) for _, ms in self.points])
         # a burst begins where a lost message follows a message that arrived
@@ -381,10 +371,10 @@ class MeasuredTrace(Result):
         }
 
     def blocks(self) -> list[str]:
-        """Returns statistics of the recorded delays as lines of text.
+        """Returns a text report of the trace, as printed by `trilat trace import`.
 
-        The command `trilat trace import` prints them. The lines contain the number of messages,
-        the losses, the delays, and how many messages were left out.
+        The lines state the number of messages, the losses, the delays, and how many messages
+        were dropped.
         """
         statistics = self.to_dict()
         samples = count_nouns(statistics["samples"], "sample")
@@ -421,10 +411,10 @@ class MeasuredTrace(Result):
         return lines
 
     def write_rows(self) -> str:
-        """Returns the trace as CSV text with the columns `t_s,delay_ms`.
+        """Formats the trace as CSV with the columns `t_s,delay_ms`.
 
-        If the text is saved in a file, a link of the model "trace" can use that file. The
-        method itself writes no file.
+        Saved to a file, the CSV can be used in a link with the delay model "trace". No file is
+        written here.
         """
         rows = ["t_s,delay_ms"]
         for t_s, ms in self.points:
@@ -436,7 +426,7 @@ class MeasuredTrace(Result):
 def import_trace(
     path: str | Path, form: str, *, way: str = "", column: str = "", every_s: float = 1.0
 ) -> MeasuredTrace:
-    """Imports measured delays from the output of `irtt`, `ping` or `fping`, or from a table.
+    """Imports measured delays from the output of `irtt`, `ping` or `fping`, or from a CSV file.
 
     >>> with open("table.csv", "w") as table:
     ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)
@@ -444,20 +434,21 @@ def import_trace(
     [10.0, 20.0]
 
     Args:
-        path: The file. It may be compressed with gzip, and its text may be UTF-16.
-        form: Format of the file: "irtt" (of `irtt client -o`), "ping" or "csv". A "csv" file
-            has a header line with the names and units of its columns.
-        way: How the delay of the link is computed, one of `WAYS`. "send" and "receive" exist
-            only for irtt, and require that its two clocks agree. By default, round trips are
-            halved (irtt, ping, and a column "rtt"), and other delays are used as they are.
-        column: Name of the column of delays in a table. By default, the first column whose name
-            stands for a delay.
-        every_s: Interval between the messages of a `ping` that prints no times, in s. `ping`
-            prints times only with its option -D, and never on Windows.
+        path: Path of the file, which may be gzip-compressed or encoded in UTF-16.
+        form: Format of the file: "irtt" (output of `irtt client -o`), "ping" (also for `fping`)
+            or "csv". A CSV file must have a header with the names and units of its columns.
+        way: How the one-way delay is computed, one of `WAYS`. "send" and "receive" are
+            available only for irtt and require synchronised clocks. By default, round-trip
+            times (from irtt, ping or a column named "rtt") are halved, and other delays are
+            used unchanged.
+        column: Name of the delay column of a CSV file. By default, the first column whose name
+            denotes a delay.
+        every_s: Interval between probes, in s, if the output of `ping` contains no timestamps.
+            Timestamps require the option -D and are never printed on Windows.
 
     Raises:
-        UsageError: There is no such format, or `way` does not exist for this format.
-        ScenarioError: The file cannot be read, or does not have this format.
+        UsageError: The format is unknown, or does not support `way`.
+        ScenarioError: The file cannot be read or is not in this format.
     """
     if form not in _READERS:
         raise UsageError(
@@ -488,10 +479,10 @@ def import_trace(
 
 
 class _Measurement(NamedTuple):
-    """Messages whose round trips or delays a measuring program has written to a file.
+    """Messages whose round trips or delays were recorded by a measurement program.
 
     Attributes:
-        samples: Send time of each message in s, and its delay in ms.
+        samples: Send time in s and delay in ms of each message.
         begin_known: False if messages before the first one may be missing from the file.
         end_known: False if messages after the last one may be missing from the file.
     """
@@ -502,10 +493,10 @@ class _Measurement(NamedTuple):
 
 
 def _build_trace(measurement: _Measurement) -> MeasuredTrace:
-    """Converts a measurement of a network to a delay trace, which a simulated link can repeat.
+    """Converts a network measurement to a delay trace that a simulated link can replay.
 
-    The messages are sorted by their sending times, which then count from the first one. Of
-    several messages with the same time in microseconds, only the first is kept.
+    Messages are sorted by send time, relative to the first one. If several messages have the
+    same time in microseconds, only the first is kept.
 
     Raises:
         ValueError: There are no messages, or a delay is negative.
@@ -551,16 +542,15 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
 
 
 def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
-    """Returns the messages in the JSON text of `irtt client -o`.
+    """Parses the JSON output of `irtt client -o`.
 
-    The times in this text are nanoseconds. The entry `lost` of a message is a word, of which
-    only "false" means that the answer arrived. The entry `stats` contains the number of sent
-    packets. If this number is larger than the number of messages, the last messages are
-    missing.
+    Times are in nanoseconds. The entry `lost` of a message is a string, and only "false" means
+    that the reply arrived. The entry `stats` contains the number of packets sent; if this
+    exceeds the number of messages, the last messages are missing.
 
     Args:
-        text: The JSON text.
-        way: How the delay is computed, one of `WAYS` or empty.
+        text: The JSON output.
+        way: How the delay is computed: one of `WAYS`, or empty.
     """
     delay_key = "rtt" if way in ("", "half", "whole") else way
     factor = 0.5 if way in ("", "half") else 1.0
@@ -578,14 +568,14 @@ def _read_irtt(text: str, way: str, *_: object) -> _Measurement:
 
 
 def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measurement:
-    """Reads the round trips of messages from the output of the programs `ping` or `fping`.
+    """Parses round trips from the output of `ping` or `fping`.
 
-    `ping_output` explains the formats of this output.
+    See `ping_output` for the formats.
 
     Args:
         text: The output.
-        way: "whole" for the round trip. Otherwise half of it is the delay.
-        every_s: Interval between the messages if the output contains no times, in s.
+        way: "whole" to use the round trip as the delay; otherwise, half of it is used.
+        every_s: Interval between messages, in s, if the output contains no timestamps.
     """
     factor = 1.0 if way == "whole" else 0.5
     probes = read_ping(text, every_s)
@@ -597,17 +587,16 @@ def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measurement:
 
 
 def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
-    """Returns the messages of a table whose header line names columns with units.
+    """Parses a table whose header contains column names with units.
 
-    Examples of header lines are "pub_time(ms) delay(ms)" and "t_s,delay_ms". The columns are
-    separated by semicolons, tabs, commas or spaces.
+    Examples of headers are "pub_time(ms) delay(ms)" and "t_s,delay_ms". Columns are separated
+    by semicolons, tabs, commas or spaces.
 
     Args:
         text: The table.
-        way: "half" if the column contains round trips, "whole" if it contains the delays. If
-            empty, the name of the column decides.
-        column: Name of the column of delays. If empty, the first column whose name stands for a
-            delay.
+        way: "half" if the column contains round trips, or "whole" if it contains delays. If
+            empty, determined from the name of the column.
+        column: Name of the delay column. If empty, the first column whose name denotes a delay.
 
     Raises:
         ValueError: A column is missing, or a line does not contain numbers.
@@ -647,21 +636,21 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
 
 
 def _split_cells(line: str, separator: str | None) -> list[str]:
-    """Splits a line of a table into cells, at white space if there is no separator."""
+    """Splits a line of a table into cells, at whitespace if there is no separator."""
     return [cell.strip() for cell in line.split(separator)]
 
 
 def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple[int, float]:
-    """Finds which column of a table contains a quantity, by the names in the header line.
+    """Finds the column of a table that contains a quantity.
 
     Args:
-        cells: Cells of the header line.
-        names: Names that the quantity may have.
-        wanted: Cell of the header above the column. If empty, the first column with one of the
-            names is used.
+        cells: Cells of the header.
+        names: Permitted names of the quantity.
+        wanted: Header of the column to use. If empty, the first column with a permitted name is
+            used.
 
     Returns:
-        The index of the column, and its unit in s.
+        Index of the column, and its unit in s.
 
     Raises:
         ValueError: There is no such column, or it has no unit.
@@ -685,7 +674,7 @@ _READERS: dict[str, Callable[[str, str, str, float], _Measurement]] = {
     "ping": _read_ping,
     "csv": _read_table,
 }
-"""Function that reads each format.
+"""Mapping from format to the function that reads it.
 
-Its arguments are the text, the way, the column and the interval in s, see `import_trace`.
+The arguments are the text, the way, the column and the interval in s (see `import_trace`).
 """

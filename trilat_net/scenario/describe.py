@@ -1,18 +1,16 @@
-"""Describes scenarios in lines of text, and lists the differences between scenarios.
+"""Describes scenarios as lines of text and lists the differences between them.
 
-A scenario is the description of an experiment with its arms, control laws and network links.
-The text also states facts that follow from a scenario, for example whether a control law
-satisfies its condition for stability, and how long an arm needs to come to rest.
+The description also states facts derived from the scenario, for example whether a control law
+satisfies its stability condition, and how long an arm needs to come to rest.
 
 Invariant:
-    - A difference that several arms or links have in common is listed once. If two arms have
-      control laws of different kinds, each law is listed as a whole. Links are always listed as
-      a whole.
-    - Names, titles and expectations only describe an experiment, and are not compared.
+    - A difference shared by several arms or links is listed once. If two arms use different
+      control laws, each law is listed in full. Links are always listed in full.
+    - Names, titles and expectations are descriptive and are not compared.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,28 +19,16 @@ import numpy as np
 
 from ..core import (
     ROW_SUM_TOLERANCE,
-    Array,
     ChainJoint,
-    DelayKind,
+    IntArray,
     link_key,
 )
 from ..errors import count_nouns
-from ..laws import ArmLoad, LawSettings, LawSituation, StabilityCondition
+from ..records import NS_PER_S
 from .arms import TASK_AXES, Arm
-from .delay_models import LinkBase
-from .operators.kernel_operators import (
-    Chirp,
-    JointSpring,
-    Multisine,
-    Pulse,
-    RecordedTorque,
-    ViscousEnvironment,
-)
 from .rest_bounds import find_rest_bounds
-from .sample_uses import count_silences, draw_used_samples
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
-from .site_spec import SiteSpec
 from .urdf import UrdfJoint
 
 # Notes on the matrix of dominance factors, the weights with which sites follow their peers.
@@ -57,158 +43,14 @@ IRREVERSIBLE_SHARES = (
 )
 
 
-def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every network link in s, for the stability conditions.
-
-    A constant delay is rounded up to whole control periods of the receiver. Delays that vary
-    are NaN.
-
-    Args:
-        links: Links by name.
-        rates_hz: Tick rates of the sites, by name.
-    """
-    names = list(rates_hz)
-    delay_s = np.zeros((len(names), len(names)))
-    for name, link in links.items():
-        sender, _, receiver = name.partition("->")
-        index = (names.index(receiver), names.index(sender))
-        model = link.to_core_model()
-        if model.kind != DelayKind.CONSTANT or link.loss or link.measured:
-            delay_s[index] = np.nan
-            continue
-        rate_hz = rates_hz[receiver]
-        delay_us = max(round(model.location), model.playout_us)
-        # rounded up, because without a delay a sample is used from the next tick on
-        ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
-        delay_s[index] = ticks / rate_hz
-    return delay_s
-
-
-def _find_hold_time(scenario: Scenario) -> float:
-    """Returns for how long the torque of an arm is held constant, in s.
-
-    This is the control period for the integration scheme "digital", and 0 for other schemes. It
-    is NaN if the control loops of the arms have different rates.
-    """
-    if scenario.scheme != "digital":
-        return 0.0
-    periods_s = {1.0 / site.rate_hz for site in scenario.sites.values()}
-    return periods_s.pop() if len(periods_s) == 1 else math.nan
-
-
-def _find_hand_impedances(site: SiteSpec, joints: int) -> tuple[ArmLoad, ...] | None:
-    """Returns the operators and environments of a site that react to the motion of its arm.
-
-    Operators whose torque depends on time alone are left out.
-
-    Args:
-        site: Description of the site.
-        joints: Number of joints of its arm.
-
-    Returns:
-        The spring and the damper of each. None if the reaction of an operator depends on the
-        pose, because the operator acts on the end effector, or if the reaction is not known,
-        because the operator is a live operator or a program.
-    """
-    impedances = []
-    for source in (*site.hands, *site.environment):
-        if isinstance(source, _TIMED_TORQUES):
-            continue
-        if not isinstance(source, JointSpring | ViscousEnvironment):
-            return None
-        # A sampled torque lags behind the motion, so it is not that of a spring and damper.
-        if source.sampled:
-            return None
-        stiffness: tuple[float, ...] = (0.0,)
-        if isinstance(source, JointSpring):
-            stiffness = source.stiffness_nm_rad
-        damping = source.damping_nm_s_rad
-        impedance = ArmLoad(
-            stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
-            damping_nm_s_rad=tuple(np.broadcast_to(damping, joints).tolist()),
-        )
-        impedances.append(impedance)
-    return tuple(impedances)
-
-
-_TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
-"""Operators whose torque depends on time alone."""
-
-
-def list_law_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
-    """Yields each arm with its control law and the facts on which its stability depends.
-
-    The facts are delays, the rates of the control loops, and the weights with which the arms
-    follow each other. A law with a stability condition evaluates it from them.
-    """
-    rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
-    delay_s = _find_link_delays(scenario.links, rates_hz)
-    hold_s = _find_hold_time(scenario)
-    hands = tuple(
-        _find_hand_impedances(site, len(site.q0_rad)) for site in scenario.sites.values()
-    )
-    for n, (name, site) in enumerate(scenario.sites.items()):
-        situation = LawSituation(
-            site=n,
-            names=scenario.names,
-            laws=scenario.controls,
-            alpha=scenario.alpha,
-            delay_s=delay_s,
-            tau_limit_nm=tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()),
-            rate_hz=site.rate_hz,
-            gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
-            hold_s=hold_s,
-            hands=hands,
-            in_task_space=scenario.layout(name).task,
-        )
-        yield name, scenario.controls[n], situation
-
-
-_LOOP_GROWS = ", but the roots of the sampled loop grow"
-"""Addition to the line about a satisfied condition if the sampled loop is unstable."""
-_SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
-"""The same addition for a condition that proves decay in continuous time."""
-
-
-def describe_law_conditions(scenario: Scenario, *, ticks_grow: bool = False) -> list[str]:
-    """Returns lines for the user that say whether the conditions of the stability proofs hold.
-
-    Every control law has its own stability conditions, for example on its gains and on the
-    delays. Sites with the same law and the same condition share a line.
-
-    Most conditions are proved for controllers that act in continuous time. A controller that
-    acts once per tick may be unstable although its condition holds.
-
-    Args:
-        scenario: Description of the experiment.
-        ticks_grow: True if the loop, computed tick by tick, is known to be unstable. The lines
-            about satisfied conditions then mention this.
-    """
-    owners: dict[tuple[str, StabilityCondition], list[str]] = {}
-    for name, law, situation in list_law_situations(scenario):
-        condition = law.condition(situation)
-        if condition:
-            owners.setdefault((law.tag, condition), []).append(name)
-    verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
-    lines = []
-    for (tag, condition), sites in owners.items():
-        verdict = verdicts[condition.holds]
-        line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
-        if ticks_grow and condition.holds:
-            line += _SAMPLING_BREAKS if condition.proves_decay else _LOOP_GROWS
-        lines.append(line)
-    return lines
-
-
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about arms for which the weights in the scenario have no effect.
+    """Returns lines about arms whose dominance factors have no effect.
 
-    The weights (dominance factors) state how much an arm follows each of the others. In some
-    control laws, other settings determine how the arms share authority.
+    In some control laws, authority is shared according to other settings.
     """
     ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
-    for name, law, situation in list_law_situations(scenario):
+    for name, law, situation in scenario.law_situations():
         reason = law.explain_idle_shares(situation)
         if not reason and name in ramped_sites and law.fixed_shares:
             reason = (
@@ -223,13 +65,13 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
 
 
 def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> list[str]:
-    """Describes a valid scenario in lines of text, as `trilat scenario check` prints them.
+    """Describes a scenario as lines of text, as printed by `trilat scenario check`.
 
     >>> len(tn.describe_scenario("paper")) > 5
     True
 
     Args:
-        scenario: Scenario, or any source that `load_scenario` accepts.
+        scenario: A scenario, or any source that `load_scenario` accepts.
 
     Raises:
         ScenarioError: The scenario is not valid.
@@ -245,7 +87,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
         f"sites: {names}; {scenario.duration_s:g} s, {', '.join(tick_counts)}",
         *_describe_links(scenario),
         *_describe_shares(scenario),
-        *describe_law_conditions(scenario),
+        *scenario.describe_law_conditions(),
         *_describe_idle_shares(scenario),
         *_describe_arms(scenario),
         *_describe_tasks(scenario),
@@ -262,7 +104,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
 
 
 def _describe_real_arms(scenario: Scenario) -> list[str]:
-    """Returns a line for each real arm with its limits and start pose, which users check."""
+    """Returns one line per real arm with its limits and start pose, for users to check."""
     lines = []
     for name in scenario.outside:
         spec = scenario.sites[name]
@@ -290,10 +132,9 @@ def _format_per_joint(values: Any, units: Sequence[str]) -> str:
 
 
 def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
-    """Joins the texts of all joints to one, and writes equal texts or units only once.
+    """Joins the per-joint strings into one, writing equal values or units only once.
 
-    For example, the texts "1", "1" with the unit "rad" give "1 rad", and "1", "2" give "1, 2
-    rad".
+    For example, "1", "1" with the unit "rad" becomes "1 rad", and "1", "2" becomes "1, 2 rad".
     """
     if len(set(units)) > 1:
         return ", ".join(f"{text} {unit}" for text, unit in zip(texts, units, strict=True))
@@ -301,9 +142,9 @@ def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
 
 
 def _describe_links(scenario: Scenario) -> list[str]:
-    """Returns a line of text for each network link, or a single line if all links are equal.
+    """Returns one line per network link, or a single line if all links are equal.
 
-    Further lines state the delay with which the users see the other arms (views).
+    Additional lines describe the delay with which users see the other arms (views).
     """
     descriptions = {name: link.describe() for name, link in scenario.links.items()}
     if len(set(descriptions.values())) > 1:
@@ -317,10 +158,7 @@ def _describe_links(scenario: Scenario) -> list[str]:
 
 
 def _describe_shares(scenario: Scenario) -> list[str]:
-    """Returns lines about consequences of the weights with which arms follow each other.
-
-    The weights form the matrix of dominance factors.
-    """
+    """Returns lines about consequences of the dominance factors."""
     beta = scenario.beta
     weights = "none: alpha is reducible, some site's weight is zero"
     if beta is not None:
@@ -338,7 +176,7 @@ def _describe_shares(scenario: Scenario) -> list[str]:
 
 
 def _describe_arms(scenario: Scenario) -> list[str]:
-    """Returns lines about each different arm with a URDF file: its joints, limits and notes."""
+    """Returns lines about each distinct arm with a URDF file: its joints, limits and notes."""
     lines: list[str] = []
     for arm, owners in _group_chains(scenario):
         chain = arm.read_chain(scenario.urdf)
@@ -357,7 +195,7 @@ def _describe_arms(scenario: Scenario) -> list[str]:
 
 
 def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
-    """Returns a line about a joint: its link, its limits and the inertia of its drive."""
+    """Returns one line about a joint: its link, its limits and the inertia of its drive."""
     unit = "m" if drive.prismatic else "rad"
     effort_unit = "N" if drive.prismatic else "N m"
     inertia_unit = "kg" if drive.prismatic else "kg m^2"
@@ -374,10 +212,7 @@ def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
 
 
 def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
-    """Returns each different arm that is read from a URDF file, with the names of its users.
-
-    The users are sites, the processes of the arms. URDF is an XML format for robots.
-    """
+    """Returns each distinct arm read from a URDF file, with the sites that use it."""
     groups: list[tuple[Arm, list[str]]] = []
     for name, spec in scenario.sites.items():
         if not spec.arm.urdf:
@@ -391,13 +226,13 @@ def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
 
 
 def list_arm_notes(scenario: Scenario) -> list[str]:
-    """Returns sentences about details of the arms that a user may not expect.
+    """Returns sentences about properties of the arms that may surprise a user.
 
     For example, a joint of the URDF file may be held fixed, or an arm may start beyond a
-    position limit, which is moved for this run. Empty if there is nothing to say.
+    position limit, which is then moved for this run. Empty if there are none.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     notes = []
     for arm, owners in _group_chains(scenario):
@@ -419,7 +254,7 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
 def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
     """Returns sentences about joints of an arm that start beyond a stop of the URDF file.
 
-    A real arm at rest may stand a little beyond the nominal position of a stop.
+    A real arm at rest can stand slightly beyond the nominal position of a stop.
     """
     spec = scenario.sites[name]
     units = scenario.arms[name].joint_units("rad")
@@ -438,7 +273,7 @@ def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
 def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
     """Returns sentences about joints of an arm that start beyond a position limit.
 
-    The limit is moved for the run, so that the arm does not stop at once.
+    The limit is moved for the run, so that the arm does not stop immediately.
     """
     spec = scenario.sites[name]
     model = scenario.arms[name]
@@ -463,7 +298,7 @@ def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
-    """Returns lines about the arms that follow each other's end effectors, not joints."""
+    """Returns lines about the arms that follow each other's end effectors instead of joints."""
     lines = []
     for name, model in scenario.arms.items():
         if not model.shares_pose:
@@ -484,10 +319,10 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
 
 
 def _describe_silences(scenario: Scenario) -> list[str]:
-    """Returns lines about how often arms will have to wait for late messages from others.
+    """Returns lines about how often arms will have to wait for late messages.
 
-    Only arms under the rule "glide" wait. They come to rest in the meantime. The number is
-    computed with the delays and losses that the network links will draw in the run.
+    Only arms with the stale rule "glide" wait, coming to rest in the meantime. The number is
+    computed from the delays and losses that the links will draw in the run.
     """
     lines = []
     for name, spec in scenario.sites.items():
@@ -497,14 +332,13 @@ def _describe_silences(scenario: Scenario) -> list[str]:
             link = scenario.links[f"{peer}->{name}"]
             if link.measured or not scenario.dominance[name].get(peer):
                 continue
-            used = draw_used_samples(
-                link=link,
+            used = link.draw_used_samples(
                 key=link_key(scenario.seed, f"{peer}->{name}"),
                 receiver_hz=spec.rate_hz,
                 sender_hz=scenario.sites[peer].rate_hz,
                 duration_s=scenario.duration_s,
             )
-            count = count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
+            count = _count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
             if not count:
                 continue
             per_minute = 60.0 * count / scenario.duration_s
@@ -519,10 +353,30 @@ def _describe_silences(scenario: Scenario) -> list[str]:
     return lines
 
 
-def _describe_stops(scenario: Scenario) -> list[str]:
-    """Returns lines about how arms come to rest while another arm is silent (rule "glide").
+def _count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
+    """Counts how often a site uses no new sample of a peer for longer than a limit.
 
-    Arms with the same text share a line.
+    The time before the first sample is ignored.
+
+    Args:
+        used: Index of the sample in use at every tick; -1 before the first sample.
+        receiver_hz: Tick rate of the site, in Hz.
+        silence_ns: Longest time without a new sample that does not count as a silence, in ns.
+    """
+    new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
+    if not len(new_sample_ticks):
+        return 0
+    gap_ticks = np.diff(new_sample_ticks, append=len(used))
+    gaps_ns = gap_ticks * NS_PER_S // receiver_hz
+    # Without a silence, the distance between new samples is one period.
+    period_ns = NS_PER_S // receiver_hz
+    return int(np.count_nonzero(gaps_ns - period_ns > silence_ns))
+
+
+def _describe_stops(scenario: Scenario) -> list[str]:
+    """Returns lines about how arms come to rest while a peer is silent (stale rule "glide").
+
+    Arms with the same description share one line.
     """
     owners: dict[str, list[str]] = {}
     for name, spec in scenario.sites.items():
@@ -534,9 +388,9 @@ def _describe_stops(scenario: Scenario) -> list[str]:
 
 
 def _describe_stop(scenario: Scenario, name: str) -> list[str]:
-    """Returns descriptions of an arm's motion after a stop, as ends of sentences.
+    """Describes the motion of an arm after a stop, as sentence endings.
 
-    They say when the arm comes to rest, and whether its motors are strong enough.
+    They state when the arm comes to rest, and whether its motors are strong enough.
     """
     spec = scenario.sites[name]
     if not spec.arm.known:
@@ -559,85 +413,86 @@ def _describe_stop(scenario: Scenario, name: str) -> list[str]:
 
 
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")
-"""Keys that describe an experiment, or that are compared separately."""
+"""Keys that only describe a scenario, or that are compared separately."""
 _MAX_VALUE_LENGTH = 80
-"""Largest length of the text of a value."""
+"""Maximum length of the string form of a value."""
 _HASH_DIGITS = 8
-"""Number of digits of a SHA-256 hash that the text of a value shows."""
+"""Number of digits of a SHA-256 hash shown in the string form of a value."""
 
 
 _EVERY_LINK = "every link"
 _SOME_LINKS = "link "
-"""Start of the key of a difference between links. The names of the links follow it."""
+"""Prefix of the key of a difference between links, followed by the names of the links."""
 
 
 class ScenarioDifference(NamedTuple):
-    """Key with different values in several experiments, as a row of a table that compares them.
+    """A key whose value differs between scenarios, as one row of a comparison table.
 
     Attributes:
-        key: Dotted path of the key, without `sites.NAME` for a key of a site.
-        owners: Names of the sites that have the difference. Empty for a key of the whole
-            experiment.
-        values: Value in each experiment as a string. "none" if the experiment lacks the key.
+        key: Dotted path of the key, relative to `sites.NAME` for a key of a site.
+        owners: Names of the sites to which the difference applies. Empty for a key of the whole
+            scenario.
+        values: Value in each scenario as a string, or "none" if the scenario does not have the
+            key.
     """
 
     key: str
     owners: tuple[str, ...]
     values: tuple[str, ...]
 
+    @classmethod
+    def list_between(cls, scenarios: Sequence[Scenario]) -> list["ScenarioDifference"]:
+        """Finds the settings in which several scenarios differ.
+
+        Includes settings that only some of the scenarios have.
+
+        Args:
+            scenarios: At least two scenarios.
+
+        Returns:
+            One entry per difference, in the order of the keys. Empty if the scenarios are
+            equal.
+        """
+        differences: list[ScenarioDifference] = []
+        site_lists = [", ".join(scenario.names) for scenario in scenarios]
+        if len(set(site_lists)) > 1:
+            differences.append(cls("sites", (), tuple(site_lists)))
+        tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
+        common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
+        differences += _compare_tables(common_tables)
+
+        # Sites with the same difference are collected in one entry.
+        owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+        for site in scenarios[0].names:
+            if not all(site in other.sites for other in scenarios):
+                continue
+            site_tables = [table["sites"][site] for table in tables]
+            for difference in _compare_tables(site_tables):
+                owners.setdefault((difference.key, difference.values), []).append(site)
+        for (key, values), sites in owners.items():
+            differences.append(cls(key, tuple(sites), values))
+        return differences + _compare_links(scenarios)
+
     @property
     def concerns_link(self) -> bool:
-        """True if the differing key belongs to a network link, such as "link m1->s"."""
+        """True if the key belongs to a network link, such as "link m1->s"."""
         return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:
-        """Returns the key that differs, with the names of the arms for which it does."""
+        """Returns the key that differs, with the names of the arms to which this applies."""
         return f"{self.key} of {', '.join(self.owners)}" if self.owners else self.key
 
 
-def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Finds the settings in which several experiments differ.
-
-    Settings that only some of the experiments have are included.
-
-    Args:
-        scenarios: Descriptions of at least two experiments.
-
-    Returns:
-        One entry for each difference, in the order of the keys. Empty if the experiments are
-        equal.
-    """
-    differences: list[ScenarioDifference] = []
-    site_lists = [", ".join(scenario.names) for scenario in scenarios]
-    if len(set(site_lists)) > 1:
-        differences.append(ScenarioDifference("sites", (), tuple(site_lists)))
-    tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
-    common_tables = [_omit_keys(table, _NOT_COMPARED) for table in tables]
-    differences += _compare_tables(common_tables)
-
-    # Sites with the same difference are collected in one entry.
-    owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for site in scenarios[0].names:
-        if not all(site in other.sites for other in scenarios):
-            continue
-        site_tables = [table["sites"][site] for table in tables]
-        for difference in _compare_tables(site_tables):
-            owners.setdefault((difference.key, difference.values), []).append(site)
-    for (key, values), sites in owners.items():
-        differences.append(ScenarioDifference(key, tuple(sites), values))
-    return differences + _compare_links(scenarios)
-
-
 def _omit_keys(table: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    """Returns a copy of a table without certain keys."""
+    """Returns a copy of a table without the given keys."""
     return {key: value for key, value in table.items() if key not in keys}
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
-    """Returns the differences between several tables of scenarios, key by key.
+    """Returns the differences between several scenario tables, key by key.
 
-    If they contain control laws of different kinds, the laws are compared as a whole, because
-    their gains have different meanings.
+    Control laws of different kinds are compared as a whole, since their gains have different
+    meanings.
     """
     laws = {table.get("control", {}).get("law") for table in tables}
     if len(laws) > 1:
@@ -656,9 +511,9 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    """Returns the differences between the network links of several experiments.
+    """Returns the differences between the network links of several scenarios.
 
-    Links with the same difference share an entry.
+    Links with the same difference share one entry.
     """
     names_by_values: dict[tuple[str, ...], list[str]] = {}
     common_names = list(scenarios[0].links)
@@ -679,13 +534,13 @@ def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
 
 
 def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    """Returns the values of a table and of all tables in it, under dotted keys.
+    """Flattens nested tables into pairs of dotted key and value.
 
-    For example, {"a": {"b": 1}} gives the pair ("a.b", 1).
+    For example, {"a": {"b": 1}} becomes [("a.b", 1)].
 
     Args:
-        table: Table with values and further tables.
-        path: Dotted key of the table itself. Empty for the outermost table.
+        table: A table, possibly nested.
+        path: Dotted key of `table` itself. Empty for the outermost table.
     """
     pairs: list[tuple[str, Any]] = []
     for key, value in table.items():
@@ -698,10 +553,10 @@ def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, A
 
 
 def describe_law(control: Mapping[str, Any]) -> str:
-    """Returns the name and gains of a control law as a short text, as in "p_d (K 20, d 4)".
+    """Returns the name and gains of a control law, as in "p_d (K 20, d 4)".
 
     Args:
-        control: Table of the law in a scenario.
+        control: The `control` table of a scenario.
     """
     # The gains of a user's law are its settings; the hash of its file is left out.
     if "code" in control:
@@ -717,11 +572,11 @@ def describe_law(control: Mapping[str, Any]) -> str:
 def _join_leading(entries: Sequence[str], separator: str) -> str:
     """Joins as many leading entries as fit into `_MAX_VALUE_LENGTH` characters.
 
-    If entries are left out, "..." takes their place. The first entry is always included.
+    The first entry is always included. Omitted entries are replaced with "...".
 
     Args:
-        entries: Texts of the entries.
-        separator: Text between two entries.
+        entries: Strings to join.
+        separator: Separator between two entries.
     """
     text = ""
     for entry in entries:
@@ -733,10 +588,10 @@ def _join_leading(entries: Sequence[str], separator: str) -> str:
 
 
 def describe_value(value: Any) -> str:
-    """Returns a value of a scenario as a short text for the user.
+    """Formats a scenario value as a short string for users.
 
-    A list of equal numbers is written as one number. Hashes of files are shortened. A table or
-    list that is too long is cut after its first entries.
+    A list of equal numbers is written as a single number, file hashes are shortened, and long
+    tables or lists are truncated.
 
     Args:
         value: Any value that a scenario may contain.

@@ -1,16 +1,14 @@
-"""Draws numbers of a scenario that are given as probability distributions.
+"""Draws the numbers that a scenario specifies as probability distributions.
 
-A scenario is a TOML file that describes an experiment. In place of a number, for example a mass
-or a gain, its author may write `{ normal = [mean, deviation] }` or `{ uniform = [low, high] }`.
-The seed, an integer in the scenario, determines the numbers that are drawn. A different seed
-gives a different random instance of the experiment.
+In place of a number, such as a mass or a gain, a scenario may contain `{ normal = [mean,
+deviation] }` or `{ uniform = [low, high] }`. The number is drawn using the seed of the
+scenario; a different seed gives a different random instance of the experiment.
 
 Invariant (L4):
-    - A drawn number depends only on the seed and on the place of the number in the scenario,
-      written as a dotted key such as `sites.s.control.Kd`. It is rounded to nine digits.
-    - A resolved scenario, in which nothing is left out, contains the drawn number, and its
-      distribution in the table `drawn`, so that another seed draws the number again. A number
-      that an override has replaced is not drawn again.
+    - A drawn number depends only on the seed and on the location of the number in the scenario,
+      given as a dotted key such as `sites.s.control.Kd`. It is rounded to nine digits.
+    - A resolved scenario contains the drawn number and, in the table `drawn`, its distribution.
+      Changing the seed redraws the number, unless an override has replaced it.
 """
 
 import re
@@ -27,21 +25,21 @@ from ..records import MAX_JOINTS
 from .key_checks import is_distribution, is_number
 
 _MAX_LIST_LENGTH = 64
-"""Longest list that may contain distributions. Longer lists are recorded tables."""
+"""Maximum length of a list that may contain distributions. Longer lists are recorded tables."""
 
 
 DISTRIBUTION_FORM = "must be { normal = [mean, deviation] } or { uniform = [low, high] }"
-"""Permitted contents of a distribution's table, as the end of a sentence about its key."""
+"""Description of a valid distribution table, as the end of a sentence about its key."""
 
 
 class _DistributionKeys(Frozen, frozen=True, omit_defaults=True, kw_only=True):
-    """Keys of a table that states a random distribution in place of a number.
+    """Keys of a table that specifies a random distribution in place of a number.
 
     The distribution is either normal or uniform, for example `{ uniform = [1, 2] }`.
 
     Attributes:
-        normal: Mean and standard deviation of a normal distribution. None for other kinds.
-        uniform: Lower and upper limit of a uniform distribution. None for other kinds.
+        normal: Mean and standard deviation of a normal distribution, otherwise None.
+        uniform: Lower and upper limit of a uniform distribution, otherwise None.
     """
 
     normal: tuple[Real, NotNegative] | None = None
@@ -49,10 +47,10 @@ class _DistributionKeys(Frozen, frozen=True, omit_defaults=True, kw_only=True):
 
 
 class StatedDistribution(_DistributionKeys, frozen=True):
-    """Table in a scenario that states a random distribution in place of a number.
+    """Scenario table that specifies a random distribution in place of a number.
 
-    Each seed then gives another number. The distribution is normal or uniform, see
-    `_DistributionKeys`.
+    The number is drawn anew for each seed. The distribution is normal or uniform (see
+    `_DistributionKeys`).
     """
 
     def __post_init__(self) -> None:
@@ -62,11 +60,10 @@ class StatedDistribution(_DistributionKeys, frozen=True):
 
 
 class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=True):
-    """Random distribution of a number in a scenario, together with the number drawn from it.
+    """Distribution of a random number in a scenario, together with the drawn number.
 
-    The author of a scenario, the description of an experiment, may state a distribution in
-    place of a number. The value can also be a pose of an operator that was copied from the
-    random start pose of an arm. In this case, both distributions are None.
+    The value can also be an operator's pose that was copied from the random start pose of an
+    arm. In that case, both distributions are None.
 
     Attributes:
         value: The drawn number, or the copied pose.
@@ -75,10 +72,10 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
     value: float | Annotated[list[float], Meta(max_length=MAX_JOINTS)]
 
     def draw(self, seed: int, key: str) -> float:
-        """Draws the number that belongs to a seed and a key.
+        """Draws the number for a given seed and key.
 
-        The same seed and key always give the same number. A hash of both gives a uniform random
-        number, which the inverse distribution function converts.
+        The result is deterministic: a hash of seed and key yields a uniform random number, to
+        which the inverse distribution function is applied.
 
         Args:
             seed: Seed of the scenario.
@@ -99,10 +96,10 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
         return float(f"{number:.9g}")
 
     def describe(self) -> str:
-        """Returns a string that describes the distribution to a user.
+        """Returns a human-readable description of the distribution.
 
-        It states the mean and standard deviation of a normal distribution, or the limits of a
-        uniform distribution. For a copied start pose, it says so.
+        States the mean and standard deviation of a normal distribution or the limits of a
+        uniform one. A copied start pose is described as such.
         """
         if self.normal is not None:
             mean, deviation = self.normal
@@ -114,16 +111,15 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
 
 
 def has_distribution(value: Any) -> bool:
-    """Returns True if a value of a scenario is a random distribution, or a list with one."""
+    """Returns True if a scenario value is a random distribution or a list that contains one."""
     entries = value if isinstance(value, list) else [value]
     return any(map(is_distribution, entries))
 
 
 def dotted_key(path: str) -> str:
-    """Converts a path in an error message to a dotted key.
+    """Converts a path from an error message to a dotted key.
 
-    For example, hands[0].peak_nm becomes hands.0.peak_nm, which is the format of a key in an
-    override.
+    For example, hands[0].peak_nm becomes hands.0.peak_nm, the form used for keys in overrides.
 
     Args:
         path: The path, with indices in brackets.
@@ -132,18 +128,18 @@ def dotted_key(path: str) -> str:
 
 
 class Draws:
-    """Draws a number from each random distribution that a scenario states.
+    """Draws a number from each random distribution in a scenario.
 
-    The object also records the distribution of each number, so that the resolved scenario
-    contains both the numbers and their distributions.
+    Also keeps the distributions, since a resolved scenario contains both the drawn numbers and
+    their distributions.
 
     Args:
         seed: Seed of the scenario.
-        known: Table `drawn` of a scenario that was resolved before. Empty for a new scenario.
+        known: Table `drawn` of a previously resolved scenario. Empty for a new scenario.
 
     Attributes:
         seed: Seed of the scenario.
-        drawn: Distribution of every number drawn so far, by its dotted key.
+        drawn: Mapping from dotted key to the distribution of each number drawn so far.
     """
 
     def __init__(self, seed: int, known: Mapping[str, Distribution]) -> None:
@@ -152,25 +148,25 @@ class Draws:
         self.drawn: dict[str, Distribution] = {}
 
     def draw_numbers(self, table: TomlTable, path: str) -> TomlTable:
-        """Replaces all distributions in a table by drawn numbers.
+        """Replaces the distributions in a table with drawn numbers.
 
-        Lists in the table are included, but inner tables are not. The given table is unchanged.
+        Handles lists in the table, but not nested tables. `table` is not modified.
 
         Args:
-            table: Table of a scenario.
-            path: Path of the table in the scenario. The path and the seed determine the
-                numbers.
+            table: A table of a scenario.
+            path: Path of the table in the scenario. Together with the seed, it determines the
+                drawn numbers.
 
         Returns:
-            A copy of the table with numbers.
+            A copy of the table in which every distribution is replaced.
         """
         return {key: self._draw_entry(value, f"{path}.{key}") for key, value in table.items()}
 
     def _draw_entry(self, value: Any, path: str) -> Any:
-        """Returns a value of a table, with a drawn number in place of a distribution.
+        """Returns a table value, with any distribution replaced with a drawn number.
 
-        A number that was drawn from a distribution before is drawn again, because the seed may
-        have changed. Other values are returned unchanged.
+        Previously drawn numbers are drawn again, since the seed may have changed. Other values
+        are returned unchanged.
         """
         if isinstance(value, list) and len(value) <= _MAX_LIST_LENGTH:
             entries = []
@@ -196,17 +192,16 @@ class Draws:
     def follow_start(
         self, table: TomlTable, key: str, pose: Sequence[float], path: str
     ) -> None:
-        """Sets the start pose of an operator to the start pose of the operator's arm.
+        """Sets the start pose of an operator to the start pose of its arm.
 
-        An operator is a person or program, or a model of a person. A pose that the author of
-        the scenario wrote is kept. A pose that this method set before is replaced, because the
-        random start pose of the arm may have changed.
+        A pose specified by the author of the scenario is kept. A pose set by an earlier call is
+        replaced, since the random start pose of the arm may have changed.
 
         Args:
-            table: Settings of the operator. They are changed.
-            key: Key of the pose in these settings.
-            pose: Start pose of the arm, in rad, or the position of its end effector, in m.
-            path: Path of the settings in the scenario.
+            table: Settings of the operator, modified in place.
+            key: Key of the pose in `table`.
+            pose: Start pose of the arm in rad, or start position of its end effector in m.
+            path: Path of `table` in the scenario.
         """
         pose_key = dotted_key(f"{path}.{key}")
         known = self._known.get(pose_key)
@@ -222,10 +217,10 @@ class Draws:
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:
-    """Reads a random distribution from a table of a scenario, without drawing a number from it.
+    """Parses a random distribution from a scenario table, without drawing from it.
 
     Raises:
-        ScenarioError: The table does not state a distribution.
+        ScenarioError: The table is not a valid distribution.
     """
     try:
         stated = msgspec.convert(table, StatedDistribution)

@@ -1,14 +1,13 @@
-"""Defines the expectations of a scenario: conditions that its runs must satisfy.
+"""Expectations of a scenario: conditions that its runs must satisfy.
 
-A scenario is a TOML file that describes an experiment. Its author writes the expectations in
-the tables `[expect]` (for the whole run) and `[[expect.windows]]` (for an interval of time),
-and the command `trilat test` evaluates them. For example, `peak_error_max_rad = 0.1` requires
-that no synchronisation error, the difference between the angle of a joint and the angle that it
-should follow, exceeds 0.1 rad.
+Expectations are specified in the tables `[expect]` (for the entire run) and
+`[[expect.windows]]` (for a time interval), and evaluated by `trilat test`. For example,
+`peak_error_max_rad = 0.1` requires that the synchronisation error (the difference between a
+joint angle and its reference) never exceeds 0.1 rad.
 
 Invariant:
-    - The name of a key contains a quantity, a limit and a unit. Its docstring defines the
-      quantity exactly. A missing key is not a condition.
+    - The name of a key consists of a quantity, a limit and a unit; its docstring defines the
+      quantity exactly. A missing key imposes no condition.
     - `..._max_...` is the largest permitted value, and `..._min_...` the smallest. The keys of
       a window contain both, as [smallest, largest].
 """
@@ -36,9 +35,9 @@ ALL_SITES_QUANTITIES = ("error_peak_rad", "speed_peak_rad_s", "torque_peak_nm")
 class _RunPart(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Keys for a part of a run (window) that are the same for every arm, see `ExpectWindow`.
+    """Keys of a window that are the same for every arm (see `ExpectWindow`).
 
-    The other keys name a joint, so they depend on the number of joints.
+    The remaining keys name a joint, so they depend on the number of joints.
     """
 
     from_s: WindowTime
@@ -62,32 +61,32 @@ else:
 
 
 class ExpectWindow(_JointPart, frozen=True, kw_only=True):
-    """Expected ranges of quantities in a part of a run, which a test checks.
+    """Expected ranges of quantities during part of a run.
 
-    For each quantity, the smallest and the largest permitted value may be stated. The force of
-    the walls is computed from the logged state. This force acts along the normal, and is summed
-    over the walls of the experiment. If a run ends before the window ends, the quantities are
-    not measured, and the expectations count as not satisfied.
+    Each quantity may be given a smallest and a largest permitted value. The wall force is
+    computed from the logged state: it is the force along the normal, summed over all walls. If
+    the run ends before the window does, nothing is measured and the expectations are not
+    satisfied.
 
     Attributes:
-        from_s: Nominal time of the first tick of the window, in s.
-        to_s: End of the window, in s. A tick at this time does not belong to the window.
-        site: Name of the site. If it is left out, all sites are evaluated together, which only
-            the first three quantities allow.
+        from_s: Start of the window (nominal time of its first tick), in s.
+        to_s: End of the window, in s, exclusive.
+        site: Name of the site. If omitted, all sites are evaluated together, which is possible
+            only for the first three quantities.
         error_peak_rad: Largest absolute synchronisation error |e| of a joint.
         speed_peak_rad_s: Largest speed of a joint.
         torque_peak_nm: Largest control torque of a joint.
         q1_rad: Angle of joint 1 at every tick, in m for a prismatic joint. q2_rad is the angle
-            of joint 2, and so on. If the URDF file names the joints, q_NAME_rad may be written
-            as well.
-        push1_mean_nm: Mean over the ticks of the torque of operators and environment ON joint
-            1. push2_mean_nm belongs to joint 2, and so on. If the URDF file names the joints,
-            push_NAME_mean_nm may be written as well.
-        wall_mean_n: Mean over the ticks of the force of the walls, with or without contact.
-        wall_deviation_n: Standard deviation of this force over the ticks (of the population).
-        wall_peak_n: Largest force of the walls.
-        wall_hits: Number of contacts that begin: ticks with a force that follow a tick of the
-            window without a force.
+            of joint 2, and so on. If the URDF file names the joints, q_NAME_rad is also
+            accepted.
+        push1_mean_nm: Mean torque of operators and environment ON the first joint, averaged
+            over the ticks. push2_mean_nm applies to joint 2, and so on. If the URDF file names
+            the joints, push_NAME_mean_nm is also accepted.
+        wall_mean_n: Mean wall force over all ticks, with or without contact.
+        wall_deviation_n: Population standard deviation of the wall force over the ticks.
+        wall_peak_n: Largest wall force.
+        wall_hits: Number of contacts that begin in the window: ticks with a wall force whose
+            preceding tick in the window has none.
     """
 
     wall_mean_n: LeastMost | None = None
@@ -97,11 +96,10 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @property
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """Yields each quantity that is checked in this part of a run, with its limits.
+        """Yields the name and limits of each quantity that is checked in this window.
 
-        Each item is the name of a quantity, which ends in its unit, and a pair of the smallest
-        and the largest permitted value, for example (0.0, 0.01). Nothing is yielded if no
-        quantity is checked.
+        The name ends in the unit. The limits are the smallest and the largest permitted value,
+        for example (0.0, 0.01). Yields nothing if no quantity is checked.
         """
         for key in _QUANTITIES:
             limits = getattr(self, key)
@@ -110,13 +108,13 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @staticmethod
     def list_quantities(joints: int) -> tuple[str, ...]:
-        """Returns the names of the quantities that can be limited in a part of a run (window).
+        """Returns the names of the quantities that can be limited in a window.
 
-        They include quantities of each joint, so their number depends on the arm.
+        The list includes quantities of individual joints such as q1_rad, so its length depends
+        on the arm.
 
         Args:
-            joints: Number of joints of the arm, which decides how many quantities such as
-                q1_rad exist.
+            joints: Number of joints of the arm.
         """
         quantities = []
         for key in _QUANTITIES:
@@ -131,41 +129,16 @@ _QUANTITIES = tuple(key for key in _WINDOW_KEYS if key not in ("from_s", "to_s",
 _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
-def complete_expect(
-    written: TomlTable, sites: TomlTable, urdf_texts: Mapping[str, str]
-) -> TomlTable:
-    """Returns the table of expectations, with indices in place of names of joints.
-
-    An expectation states what a test of the scenario requires of a run. It may apply to a
-    window of time and to one joint. The author may name this joint as in the URDF file of the
-    arm; the result contains its index.
-
-    Args:
-        written: Table `expect` as its author wrote it.
-        sites: Complete tables of the sites, by name.
-        urdf_texts: Texts of the URDF files, by name.
-    """
-    if "windows" not in written:
-        return written
-    joint_names = {}
-    for name, site in sites.items():
-        if site["arm"].get("urdf"):
-            chain = msgspec.convert(site["arm"], Arm).read_chain(urdf_texts)
-            joint_names[name] = tuple(joint.name for joint in chain.joints)
-    return {**written, "windows": _number_window_joints(written["windows"], joint_names)}
-
-
 def _number_window_joints(
     written: list[TomlTable], joint_names: Mapping[str, tuple[str, ...]]
 ) -> list[TomlTable]:
-    """Replaces the names of joints in expectations by their numbers.
+    """Replaces joint names in the keys of windows with joint numbers.
 
-    Expectations for a part of a run (a window) have keys such as q_elbow_rad. This key becomes
-    q3_rad if the elbow is the third joint.
+    For example, q_elbow_rad becomes q3_rad if the elbow is the third joint.
 
     Args:
-        written: Windows as their author wrote them.
-        joint_names: Names of the joints of each site's arm, in their order.
+        written: Windows as written by their author.
+        joint_names: Mapping from site name to the ordered names of the arm's joints.
 
     Returns:
         The windows with the new keys.
@@ -183,7 +156,7 @@ def _number_window_joints(
 
 
 def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlTable:
-    """Returns a table in which names of joints in the keys are replaced by their numbers.
+    """Replaces joint names in the keys of one window with joint numbers.
 
     For example, "q_elbow_rad" becomes "q3_rad" if the elbow is the third joint of the arm.
 
@@ -205,10 +178,10 @@ def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlT
 
 
 def _split_joint_key(key: str) -> tuple[str, str, str]:
-    """Splits a key that names a joint into its prefix, the name and its suffix.
+    """Splits a key that contains a joint name into prefix, name and suffix.
 
     For example, "q_elbow_rad" is split into "q", "elbow" and "_rad". All parts are empty if the
-    key does not name a joint.
+    key contains no joint name.
     """
     for prefix, suffix in (("q", "_rad"), ("push", "_mean_nm")):
         if key.startswith(f"{prefix}_") and key.endswith(suffix):
@@ -220,16 +193,16 @@ def _split_joint_key(key: str) -> tuple[str, str, str]:
 def _find_window_problem(
     window: ExpectWindow, joint_counts: Mapping[str, int]
 ) -> KeyProblem | None:
-    """Returns the reason why no run could satisfy a window of expectations.
+    """Looks for a reason why no run could satisfy a window of expectations.
 
-    For example, the smallest permitted value may be larger than the largest one.
+    For example, a smallest permitted value may exceed the largest one.
 
     Args:
-        window: Part of a run with the permitted values of some quantities.
-        joint_counts: Number of joints of each site's arm, by the name of the site.
+        window: Part of a run with the permitted ranges of some quantities.
+        joint_counts: Mapping from site name to the number of joints of its arm.
 
     Returns:
-        The key and the reason. None if the window is possible.
+        The key and the reason, or None if the window can be satisfied.
     """
     sites = f"the sites are {', '.join(joint_counts)}"
     if window.to_s <= window.from_s:
@@ -259,51 +232,52 @@ def _find_window_problem(
 
 
 END_WINDOW_S = 1.0
-"""Duration of the last part of a run, to which the keys `end_...` apply, in s."""
+"""Duration of the final part of a run, to which the keys `end_...` apply, in s."""
 
 
 class Expect(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
 ):
-    """Conditions that every run of an experiment must satisfy, for every random seed.
+    """Conditions that every run of a scenario must satisfy, whatever the random seed.
 
-    The command `trilat test` checks them. The error of an arm is e = q_i - q_id, Eq. (9): its
-    joint angles q_i minus the position q_id that it should follow. |e| is evaluated for each
-    joint separately. "Largest" and "smallest" refer to all arms (or network links), all joints
-    and all control periods. If an arm diverges, the run ends there. Only the part before the
-    divergence counts, and the run fails unless `stable = false` is expected.
+    Checked by `trilat test`. The error of an arm is e = q_i - q_id, Eq. (9): its joint angles
+    q_i minus the reference q_id. |e| is evaluated separately for each joint. "Largest" and
+    "smallest" refer to all arms (or network links), all joints and all control periods. If an
+    arm diverges, the run ends at that point: only the part before the divergence is evaluated,
+    and the run fails unless `stable = false` is expected.
 
     Attributes:
         stable: True if the run must be stable, False if it must be unstable. A run whose
-            stability cannot be decided fails both, see `analysis.run_end`.
+            stability cannot be decided fails in both cases (see `analysis.run_end`).
         synchronised_by_s: Time from which the largest |e| must stay below `synchronised_rad`
             until the end of the run, in s.
-        synchronised_rad: Limit of |e| below which the sites count as synchronised, in rad.
-        peak_error_max_rad: Upper limit of the largest |e| of the run.
+        synchronised_rad: Value of |e| below which the sites count as synchronised, in rad.
+        peak_error_max_rad: Upper limit on the largest |e| of the run.
         peak_error_min_rad: Lower limit of the same quantity.
-        rms_error_max_rad: Upper limit of the root mean square of e over the run, for the joint
+        rms_error_max_rad: Upper limit on the root mean square of e over the run, for the joint
             with the largest value.
-        end_error_max_rad: Upper limit of the largest |e| in the last second.
+        end_error_max_rad: Upper limit on the largest |e| in the last second.
         end_error_min_rad: Lower limit of the same quantity.
-        end_spread_max_rad: Upper limit of the largest difference in the last second between two
-            sites' angles of the same joint at the same time, without delay. It is evaluated at
-            the ticks of the first site.
-        end_pose_rad: Expected joint angles at the last tick, by the name of the site, in rad.
+        end_spread_max_rad: Upper limit on the largest difference during the last second between
+            the simultaneous (undelayed) angles of the same joint at two sites. Evaluated at the
+            ticks of the first site.
+        end_pose_rad: Mapping from site name to the expected joint angles at the last tick, in
+            rad.
         end_pose_within_rad: Largest permitted deviation from each of these angles, in rad.
-        peak_torque_max_nm: Upper limit of the control torque of a joint.
-        peak_speed_max_rad_s: Upper limit of the speed of a joint.
-        age_max_ms: Upper limit of the age of the sample in use (now minus its send time), from
-            the first sample of a link on. A link on which no sample ever comes into use fails.
-        mean_age_max_ms: Upper limit of this age averaged over the ticks, for the link with the
+        peak_torque_max_nm: Upper limit on the control torque of a joint.
+        peak_speed_max_rad_s: Upper limit on the speed of a joint.
+        age_max_ms: Upper limit on the age of the sample in use (current time minus send time),
+            from the first sample of each link on. A link of which no sample is ever used fails.
+        mean_age_max_ms: Upper limit on this age averaged over the ticks, for the link with the
             largest average.
-        mean_age_min_ms: Lower limit of this average, for the link with the smallest average.
+        mean_age_min_ms: Lower limit on this average, for the link with the smallest average.
         late_samples_max: Largest permitted number of samples, over all links, that arrived
             after they were due.
-        no_gaps: If True, there must be a record of every tick, from 0 to the last tick that any
+        no_gaps: If True, every tick must have a record, from tick 0 to the last tick that any
             site had to compute. If False, gaps are permitted.
-        windows: Expectations of parts of the run, see `ExpectWindow`.
-        metrics: [smallest, largest] permitted value of any number that `trilat metrics`
-            measures, by its key, over the whole run as in `trilat compare`.
+        windows: Expectations for parts of the run (see `ExpectWindow`).
+        metrics: Mapping from the key of a metric of `trilat metrics` to its [smallest, largest]
+            permitted value over the entire run, as in `trilat compare`.
     """
 
     stable: bool | None = None
@@ -327,27 +301,49 @@ class Expect(
     windows: tuple[ExpectWindow, ...] = ()
     metrics: dict[str, LeastMost] = {}
 
+    @staticmethod
+    def complete_table(
+        written: TomlTable, sites: TomlTable, urdf_texts: Mapping[str, str]
+    ) -> TomlTable:
+        """Returns the `expect` table with joint names replaced by joint indices.
+
+        The author may refer to a joint by its name in the URDF file of the arm.
+
+        Args:
+            written: Table `expect` as written by its author.
+            sites: Mapping from site name to the complete table of the site.
+            urdf_texts: Mapping from name to content of the URDF files.
+        """
+        if "windows" not in written:
+            return written
+        joint_names = {}
+        for name, site in sites.items():
+            if site["arm"].get("urdf"):
+                chain = msgspec.convert(site["arm"], Arm).read_chain(urdf_texts)
+                joint_names[name] = tuple(joint.name for joint in chain.joints)
+        return {**written, "windows": _number_window_joints(written["windows"], joint_names)}
+
     @property
     def has_expectations(self) -> bool:
-        """True if the experiment states at least one condition that its runs must satisfy.
+        """True if there is at least one condition for runs to satisfy.
 
-        A tolerance alone does not count, because it only says how precisely other conditions
-        are judged.
+        A tolerance alone does not count, since it only qualifies other conditions.
         """
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()
 
     def find_problem(self, joint_counts: Mapping[str, int]) -> KeyProblem | None:
-        """Returns the reason why no run could satisfy the expectations of an experiment.
+        """Looks for an expectation that no run could satisfy.
 
-        For example, an expected end pose must have as many angles as the arm has joints. The
-        problem is reported when the experiment is loaded, and not after a long run.
+        For example, an expected end pose must have as many angles as the arm has joints. Such a
+        problem is reported when the scenario is loaded instead of after a long run.
 
         Args:
-            joint_counts: Number of joints of each site's arm, by the name of the site.
+            joint_counts: Mapping from site name to the number of joints of its arm.
 
         Returns:
-            The reason, with the path of its key below `expect`. None if a run may satisfy them.
+            The reason and the path of the key relative to `expect`, or None if there is no
+            problem.
         """
         for name, pose in self.end_pose_rad.items():
             key = f"end_pose_rad.{name}"

@@ -1,12 +1,11 @@
-"""Checks the keys of a scenario that the types of its tables cannot check.
+"""Checks scenario keys for mistakes that the types of the tables cannot detect.
 
-A scenario is a TOML file that describes an experiment with several robot arms. The types of its
-tables (`fields`) limit single numbers. The functions of this module check the rest, for example
-that a vector has one number per joint of its arm, and that a key has a known name.
+The types (see `fields`) restrict individual numbers. This module checks the rest, for example
+that a vector has one entry per joint of its arm, and that the name of a key is valid.
 
 Invariant:
-    - An error names the path of the key as the author of the scenario wrote it. For an unknown
-      name it suggests the most similar valid name.
+    - An error contains the path of the key as written by the author of the scenario. For an
+      unknown name, it suggests the most similar valid name.
 """
 
 import math
@@ -28,14 +27,14 @@ StructType = type[msgspec.Struct]
 class VectorCounts(NamedTuple):
     """Lengths of the vectors that belong to one arm, for example 6 gains for 6 joints.
 
-    An author may state one number where a vector is needed. The counts determine the length of
-    that vector, and serve to check vectors that are given in full.
+    Used to check the length of vectors in a scenario, and to expand a scalar to a vector.
 
     Attributes:
-        joints: Length of a vector with one number per joint.
-        parameters: Length of a vector with one number per dynamic parameter of the arm.
-        axes: Length of a vector with one number per axis of space: 2 in a plane, otherwise 3.
-        shared: Length of a vector with one number per coordinate that the sites exchange, for
+        joints: Length of a vector with one entry per joint.
+        parameters: Length of a vector with one entry per dynamic parameter of the arm.
+        axes: Length of a vector with one entry per spatial axis: 2 for a planar arm, otherwise
+            3.
+        shared: Length of a vector with one entry per coordinate that the sites exchange, for
             example per joint or per axis of the end effector.
     """
 
@@ -46,14 +45,11 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns the lengths of the vectors that belong to a spatial arm with several joints.
-
-        Gains per joint, for example, need as many numbers as the arm has joints.
+        """Returns the vector lengths for a chain with the given number of joints.
 
         Args:
             joints: Number of joints of the arm.
-            shared: Number of coordinates that the sites exchange. 0 stands for the number of
-                joints.
+            shared: Number of coordinates that the sites exchange. If 0, the number of joints.
         """
         return cls(
             joints=joints,
@@ -64,10 +60,10 @@ class VectorCounts(NamedTuple):
 
 
 def find_extra(hint: Any, name: str) -> str | None:
-    """Returns the value that the annotation of a type states in `Meta.extra` under a name.
+    """Looks up a name in the `Meta.extra` of a type annotation.
 
-    For example, `Annotated[str, Meta(extra={"must_be": "a name"})]` states "a name" under
-    "must_be". The result is None if the type states nothing under this name.
+    For example, `Annotated[str, Meta(extra={"must_be": "a name"})]` yields "a name" for
+    "must_be". Returns None if the annotation does not contain the name.
     """
     # Only a type of the form `Annotated[type, ...]` has this attribute.
     for annotation in getattr(hint, "__metadata__", ()):
@@ -79,21 +75,20 @@ def find_extra(hint: Any, name: str) -> str | None:
 
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
-    """Finds the keys of a table that are vectors, and the count that determines each length.
+    """Finds the vector keys of a table, and the count that determines the length of each.
 
-    The fields of a structure type are the keys of a table in a scenario. The length of a vector
-    depends on the arm, for example on its number of joints. The annotation of its field states
-    the count: a field `Kd: Annotated[tuple[float, ...], Meta(extra={"per": "joints"})]` has one
-    number per joint, and its entry in the result is `"Kd": "joints"`.
+    The length of a vector depends on the arm, for example on its number of joints. It is
+    declared in the annotation of the field: `Kd: Annotated[tuple[float, ...],
+    Meta(extra={"per": "joints"})]` has one entry per joint, and appears in the result as `"Kd":
+    "joints"`.
 
     Args:
-        kind: The structure type of the table.
-        extra: Kind of vectors to find, as a key of `Meta.extra`. "per" for vectors that a
-            single number may stand for. "point" for points in space, which must be written in
-            full.
+        kind: Structure type of the table.
+        extra: Kind of vectors to find, as a key of `Meta.extra`: "per" for vectors that a
+            scalar may stand for, or "point" for points in space, which must be written in full.
 
     Returns:
-        For each vector, by its key, the name of the field of `VectorCounts` with its length.
+        Mapping from vector key to the field of `VectorCounts` that contains its length.
     """
     count_names = {}
     for key, hint in get_type_hints(kind, include_extras=True).items():
@@ -107,20 +102,20 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
 
 @lru_cache(maxsize=256)
 def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
-    """Returns the fields of a type that describes a table of a scenario file, such as `Arm`.
+    """Returns the fields of a scenario table type such as `Arm`.
 
-    The result is cached, because `msgspec.structs.fields` evaluates the annotations of the type
-    again in each call, and a scenario has many tables of the same type.
+    The result is cached: `msgspec.structs.fields` evaluates the annotations again on each call,
+    and a scenario has many tables of the same type.
     """
     return msgspec.structs.fields(kind)
 
 
 def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
-    """Expands single numbers to vectors of the length that the arm needs.
+    """Expands scalars to vectors of the length that the arm needs.
 
-    For example, `Kd = 5` becomes one 5 per joint. The same holds for a distribution such as
-    `{ uniform = [1, 2] }`. A missing vector gets the default of its type, with the right
-    length.
+    For example, `Kd = 5` becomes a vector of fives with one entry per joint. A distribution
+    such as `{ uniform = [1, 2] }` is repeated in the same way. A missing vector is set to the
+    default of its type, with the right length.
 
     Args:
         table: A table of a scenario.
@@ -128,7 +123,7 @@ def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> 
         counts: Lengths of the vectors of the site.
 
     Returns:
-        The table with these vectors. Other keys are unchanged.
+        The expanded table. Other keys are unchanged.
     """
     lengths: dict[str, int] = {}
     for key, per in _vector_keys(kind, "per").items():
@@ -159,17 +154,17 @@ _COUNT_TEXTS = {
 def find_count_problem(
     table: TomlTable, kind: StructType, counts: VectorCounts
 ) -> KeyProblem | None:
-    """Finds the first vector of a table that has too few or too many numbers.
+    """Finds the first vector of a table that has too few or too many entries.
 
-    A single number that stands for a vector is not a problem.
+    A scalar in place of a vector is not a problem.
 
     Args:
-        table: A table of a scenario, whose values have the right types.
+        table: A table of a scenario whose values have the right types.
         kind: Type of the table.
         counts: Lengths of the vectors of the site.
 
     Returns:
-        The key and the problem. None if all vectors have the right lengths.
+        The key and the problem, or None if all vectors have the right length.
     """
     count_names = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
     for key, per in count_names.items():
@@ -184,23 +179,21 @@ def find_count_problem(
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Returns True if a value from a scenario file is a number.
+    """Returns True if a TOML value is a number.
 
-    The values true and false are not numbers, although they are integers in Python.
+    Booleans are not numbers, although they are integers in Python.
 
     Args:
-        value: A value as it was read from TOML.
+        value: A value as read from TOML.
     """
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def is_distribution(value: Any) -> bool:
-    """Returns True if a value from a scenario file is a random distribution.
-
-    Each run draws a number from it, for example from `{ uniform = [1, 2] }`.
+    """Returns True if a TOML value is a random distribution, as in `{ uniform = [1, 2] }`.
 
     Args:
-        value: A value as it was read from TOML.
+        value: A value as read from TOML.
     """
     if not isinstance(value, dict):
         return False
@@ -210,15 +203,15 @@ def is_distribution(value: Any) -> bool:
 def check_keys(
     table: Any, valid: Sequence[str], path: str, elsewhere: Sequence[str] = ()
 ) -> TomlTable:
-    """Checks that a value of a scenario is a table that contains only valid keys.
+    """Raises ScenarioError unless a value is a table with only valid keys.
 
     The error suggests the key that the author may have meant.
 
     Args:
         table: A value of a scenario.
-        valid: The keys that the table may have.
-        path: Dotted path of the table, for errors.
-        elsewhere: Dotted paths of keys in other tables, which the user may have meant.
+        valid: Keys that the table may have.
+        path: Dotted path of the table, for error messages.
+        elsewhere: Dotted paths of keys in other tables that the author may have meant.
 
     Returns:
         The table, unchanged.
@@ -236,12 +229,12 @@ def check_keys(
 
 
 def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str]) -> str:
-    """Explains that a table must not have a key, and suggests the key that may be meant.
+    """Returns a message that a key is unknown, with a suggestion for the intended key.
 
     Args:
         key: The unknown key.
-        valid: The keys that the table may have.
-        elsewhere: Dotted paths of keys in other tables, which the author may have meant.
+        valid: Keys that the table may have.
+        elsewhere: Dotted paths of keys in other tables that the author may have meant.
     """
     hint = hint_at_quotes(key) or suggest_nearest(key, valid, elsewhere)
     if not hint:
@@ -250,16 +243,16 @@ def describe_unknown_key(key: str, valid: Sequence[str], elsewhere: Sequence[str
 
 
 def hint_at_quotes(text: str) -> str:
-    """Returns a hint for a text that a shell has cut off at the ">" of the name of a link.
+    """Returns a hint for an argument that a shell has cut off at the ">" of a link name.
 
-    A shell interprets ">" outside quotes as a redirection of the output into a file. The
-    program then receives only "links.m1-" of `links.m1->s.delay_ms=5`.
+    Outside quotes, a shell treats ">" as output redirection. Of the argument
+    `links.m1->s.delay_ms=5`, the program then receives only "links.m1-".
 
     Args:
         text: A key or an override.
 
     Returns:
-        The end of a sentence. Empty if the text does not end in this way.
+        Text to append to an error message. Empty if the argument was not cut off.
     """
     if not text.endswith("-"):
         return ""
@@ -270,7 +263,7 @@ def hint_at_quotes(text: str) -> str:
 
 
 def field_names(kind: StructType) -> tuple[str, ...]:
-    """Returns the keys that a table of a scenario may have, from the type that describes it.
+    """Returns the keys that a scenario table of the given type may have.
 
     Args:
         kind: Type of the table.
@@ -279,17 +272,16 @@ def field_names(kind: StructType) -> tuple[str, ...]:
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
-    """Refuses a word of a scenario, such as the name of a law, that is not a valid choice.
-
-    The error suggests the most similar valid word.
+    """Raises ScenarioError if a value, such as the name of a law, is not a valid choice.
 
     Args:
         word: A value of a scenario.
-        valid: The valid words.
-        path: Dotted path of the key, for errors.
+        valid: The valid choices.
+        path: Dotted path of the key, for error messages.
 
     Raises:
-        ScenarioError: The word is not valid. The message suggests a similar one.
+        ScenarioError: The value is not a valid choice. The message suggests the most similar
+            one.
     """
     if word not in valid:
         quoted = [repr(choice) for choice in valid]
@@ -299,16 +291,16 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
 
 
 def check_finite(value: Any, path: str) -> None:
-    """Checks that all numbers in a value from a scenario file are finite and fit into 64 bits.
+    """Raises ScenarioError if a number is not finite or does not fit into 64 bits.
 
-    Tables and lists are checked with everything that they contain.
+    Tables and lists are checked recursively.
 
     Args:
         value: A value of a scenario.
-        path: Dotted path of the key, for errors.
+        path: Dotted path of the key, for error messages.
 
     Raises:
-        ScenarioError: A number is refused. The error has the path of its key.
+        ScenarioError: A number is rejected. The error contains the path of its key.
     """
     if isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"must be a finite number, but is {value}", path=path)

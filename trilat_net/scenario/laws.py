@@ -1,11 +1,11 @@
-"""Finds the control laws that a scenario can choose, by name.
+"""Looks up control laws by the name that a scenario gives.
 
-A scenario, the description of an experiment, names the law of each arm. The law computes the
-torques of the arm from its own state and from the delayed states of the other arms.
+A control law computes the torques of an arm from the state of the arm and the delayed states of
+its peers.
 
 Invariant:
-    - A law is found by its file in the package `trilat_net.laws`. The class in this file has
-      the same name as the file. There is no other list of laws.
+    - A law is found through its file in the package `trilat_net.laws`, which contains a class
+      with the same name as the file. There is no other list of laws.
 """
 
 from typing import TYPE_CHECKING, Union
@@ -16,12 +16,12 @@ from ..own_code import ImportedLaw
 BUILT_IN: dict[str, type[ControlLaw]] = {
     str(law.Settings.__struct_config__.tag): law for law in ControlLaw.find_built_in()
 }
-"""Classes of the built-in laws, by name."""
+"""Mapping from name to class of the built-in laws."""
 LAWS: dict[str, type[LawSettings]] = {
     **{name: law.Settings for name, law in BUILT_IN.items()},
     str(ImportedLaw.__struct_config__.tag): ImportedLaw,
 }
-"""Type of the gains of each law, by name. All laws of users have the same type and name."""
+"""Mapping from law name to the type of its gains. All users' laws share one type and name."""
 if TYPE_CHECKING:
     ChosenLaw = LawSettings
 else:

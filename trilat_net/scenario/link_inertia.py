@@ -1,15 +1,15 @@
-"""Replaces the masses and inertias of a robot's bodies by stated or physically possible ones.
+"""Corrects the masses and inertias of a robot's links.
 
-Some URDF files (XML descriptions of robots) contain inertias that no body can have, for example
-because one principal moment exceeds the sum of the other two. The author of an experiment can
-state other values in the scenario, or let the program balance the inertia, which replaces it by
-the nearest possible one. A link is one body of a robot arm here.
+Some URDF files contain inertias that are physically impossible, for example because one
+principal moment exceeds the sum of the other two. A scenario can either specify other values,
+or let the program balance the inertia, which replaces it with the nearest possible one. In this
+module, a link is a rigid body of a robot arm.
 
 Invariant:
-    - A key in the scenario replaces the value in the file. Without the key, the file applies.
-    - Balancing uses only sums, products, quotients and square roots in a fixed order, so that
-      the result has the same bits on every machine.
-    - Balancing does not change a possible inertia.
+    - A key in the scenario overrides the value in the file. Without the key, the file applies.
+    - Balancing uses only sums, products, quotients and square roots in a fixed order, so the
+      result has the same bits on every machine.
+    - Balancing leaves a possible inertia unchanged.
 """
 
 import math
@@ -33,17 +33,17 @@ TensorEntries = Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length
 
 
 class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
-    """Mass and inertia of a robot's link that replace those in its URDF file.
+    """Mass and inertia of a robot link that override those in its URDF file.
 
-    Many such files contain inertias that are wrong or missing.
+    Many URDF files contain wrong inertias or none at all.
 
     Attributes:
         mass_kg: Mass, in kg. 0 removes the body of the link. By default, the mass in the file.
-        com_m: Centre of mass in the frame of the link, in m. By default, the centre of mass in
-            the file, or the origin of the frame if the file states none.
+        com_m: Centre of mass in the link frame, in m. By default, taken from the file, or the
+            origin of the link frame if the file has none.
         inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, in the axes of the
-            link's frame. By default, the inertia in the file, or zero (a point mass) if the
-            file states none.
+            link's frame. By default, taken from the file, or zero (a point mass) if the file
+            has none.
     """
 
     mass_kg: fields.NotNegative | None = None
@@ -51,41 +51,41 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the names of the inertial parameters that the scenario states for the link.
+        """Returns the names of the inertial parameters that the scenario specifies.
 
-        The others are taken from the URDF file of the arm.
+        The remaining parameters are taken from the URDF file of the arm.
         """
         keys = field_names(LinkInertia)
         return [key for key in keys if getattr(self, key) is not None]
 
 
 def fill_tensor(entries: Sequence[float]) -> Matrix:
-    """Returns the symmetric 3 x 3 inertia tensor of a body from its six different entries.
+    """Returns the symmetric 3 x 3 inertia tensor with the given six entries, in kg m^2.
 
     Args:
-        entries: The entries xx, xy, yy, xz, yz, zz, in this order, in kg m^2.
+        entries: The entries xx, xy, yy, xz, yz, zz, in kg m^2.
     """
     xx, xy, yy, xz, yz, zz = entries
     return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
 
 def balance_tensor(tensor: Matrix) -> Matrix:
-    """Returns the inertia tensor nearest to a given one that a real body can have.
+    """Returns the physically possible inertia tensor nearest to a given one, in kg m^2.
 
-    The tensor in a URDF file may be impossible, for example because of rounding. Let I_1, I_2
-    and I_3 be the principal moments of inertia. The second moments of the mass along the
+    A tensor from a URDF file may be impossible, for example because of rounding. Let I_1, I_2
+    and I_3 be its principal moments of inertia. The second moments of the mass along the
     principal axes are
 
         s_k = (I_1 + I_2 + I_3) / 2 - I_k.
 
-    A body can have the tensor if no s_k is negative. Otherwise the negative s_k are set to
-    zero. This is the projection onto the set of possible mass distributions. The moments are
-    then composed again:
+    The tensor is possible if no s_k is negative. Otherwise negative s_k are set to zero, which
+    projects the tensor onto the set of possible mass distributions. The moments are then
+    recomputed:
 
         I_k = s_1 + s_2 + s_3 - s_k.
 
-    The principal axes do not change. If only the triangle inequality was violated, the largest
-    moment does not change either, and the two smaller ones grow by the same amount.
+    The principal axes are unchanged. If only the triangle inequality was violated, the largest
+    moment is also unchanged, and the two smaller moments increase by the same amount.
 
     Args:
         tensor: Symmetric inertia tensor about the centre of mass, in kg m^2.
@@ -99,14 +99,14 @@ def balance_tensor(tensor: Matrix) -> Matrix:
     balanced = [total - second for second in second_moments]
 
     def compute_entry(i: int, j: int) -> float:
-        """Returns an entry of the corrected inertia tensor, in kg m^2.
+        """Returns one entry of the corrected inertia tensor, in kg m^2.
 
         The tensor is R diag(m) R', where the columns of R are the principal axes and m contains
         the corrected principal moments of inertia.
 
         Args:
-            i: Row of the entry, from 0 to 2.
-            j: Column of the entry, from 0 to 2.
+            i: Row index, from 0 to 2.
+            j: Column index, from 0 to 2.
         """
         first = axes[i][0] * balanced[0] * axes[j][0]
         second = axes[i][1] * balanced[1] * axes[j][1]
@@ -120,7 +120,7 @@ def balance_tensor(tensor: Matrix) -> Matrix:
 def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
     """Returns the principal moments of a symmetric tensor, and the principal axes as columns.
 
-    The method is Jacobi's, in plain Python arithmetic. The routines of LAPACK differ between
+    Uses Jacobi's method in plain Python arithmetic, since results of LAPACK differ between
     machines in the last bits.
     """
     a = [list(row) for row in tensor]
@@ -142,7 +142,7 @@ def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
 
 
 def _rotate_rows(matrix: list[list[float]], p: int, q: int, cosine: float, sine: float) -> None:
-    """Rotates two rows of a matrix into each other by an angle, in place (Jacobi)."""
+    """Applies a Jacobi rotation to two rows of a matrix, in place."""
     for column in range(3):
         upper = matrix[p][column]
         lower = matrix[q][column]
@@ -153,7 +153,7 @@ def _rotate_rows(matrix: list[list[float]], p: int, q: int, cosine: float, sine:
 def _rotate_columns(
     matrix: list[list[float]], p: int, q: int, cosine: float, sine: float
 ) -> None:
-    """Rotates two columns of a matrix into each other by an angle, in place (Jacobi)."""
+    """Applies a Jacobi rotation to two columns of a matrix, in place."""
     for row in matrix:
         left = row[p]
         right = row[q]

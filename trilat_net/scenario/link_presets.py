@@ -1,11 +1,10 @@
-"""Lists the presets of links: settings of typical networks that a scenario can choose by name.
+"""Link presets: settings of typical networks that a scenario can select by name.
 
-A scenario, the description of an experiment, connects its arms by links. A preset such as "4g"
-stands for the delay model of a link and its keys.
+A preset such as "4g" stands for a delay model and its keys.
 
 Invariant:
-    - A preset is a table that an author could have written as well. The file
-      `scenarios/_presets.toml` contains the presets and their sources.
+    - A preset contains nothing that an author could not write in a scenario. The presets and
+      their sources are in the file `scenarios/_presets.toml`.
 """
 
 import tomllib
@@ -17,12 +16,12 @@ PRESETS_FILE = SHIPPED_FOLDER / "_presets.toml"
 
 GRID_ROUND_TRIPS_MS = (8, 68, 136, 272, 544, 1088)
 GRID_LOSSES_PERCENT = (0, 10, 25, 50)
-"""Losses of the grid of presets, in percent. The round trips are in `GRID_ROUND_TRIPS_MS`.
+"""Losses in the grid of presets, in percent. See `GRID_ROUND_TRIPS_MS` for the round trips.
 
-The ranges are those of Rodriguez-Seda, Lee and Spong, "Experimental Comparison Study of Control
-Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): round trips of 8 to
-1088 ms and losses of 0 to 50 %. The grid points are our choice, because we do not know those of
-the study.
+The ranges are taken from Rodriguez-Seda, Lee and Spong, "Experimental Comparison Study of
+Control Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): round trips
+of 8 to 1088 ms and losses of 0 to 50 %. The grid points are our own choice, since those of the
+study are not known.
 """
 
 _GRID: dict[str, dict[str, Any]] = {
@@ -38,8 +37,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     **tomllib.loads(PRESETS_FILE.read_text(encoding="utf-8")),
     **_GRID,
 }
-"""The keys of a link that each preset stands for, by the name of the preset.
+"""Mapping from preset name to the link keys that it stands for.
 
-The presets of the grid, such as `rtt68-loss10`, delay each direction by half of the round trip.
-They lose each sample independently of the others.
+Presets of the grid, such as `rtt68-loss10`, delay each direction by half of the round trip and
+lose samples independently.
 """

@@ -1,13 +1,12 @@
-"""Completes the tables of the links of a scenario: delay models, presets, recorded delays.
+"""Completes the link tables of a scenario with defaults, presets and recorded delays.
 
-A scenario is a TOML file that describes an experiment. A link is the one-way network connection
-between two sites, the processes of the arms. The table `link` applies to all links, and the
-table `links` contains the settings of single links, for example of "m1->s".
+The table `link` applies to all links, and the table `links` contains the settings of individual
+links such as "m1->s".
 
 Invariant:
-    - A complete link contains the keys of its preset, but not the preset's name, so that an
-      experiment does not change if the preset is changed. It contains recorded delays, but does
-      not name a file.
+    - A complete link contains the keys of its preset but not the name of the preset, so a later
+      change to the preset does not affect the experiment. It contains recorded delays but names
+      no file.
 """
 
 from ..errors import ScenarioError, suggest_nearest
@@ -24,15 +23,15 @@ from .written_tables import TRACE_KEYS, check_link
 def complete_link_tables(
     common: TomlTable, written: TomlTable, names: list[str], files: NamedFiles
 ) -> TomlTable:
-    """Returns the table of every network link with all its keys, by the name of the link.
+    """Returns a mapping from link name to the complete table of each network link.
 
-    Keys that the author left out get the values for all links, or their defaults.
+    Keys that the author left out are taken from `common`, or set to their defaults.
 
     Args:
-        common: Settings of all links as their author wrote them, the table `link`.
-        written: Settings of single links, by the name of the link.
-        names: Names of all sites, between which there are links.
-        files: Files of delays that links may name.
+        common: Table `link`, the settings of all links as written by their author.
+        written: Mapping from link name to the settings of an individual link.
+        names: Names of all sites.
+        files: Delay files that the links may name.
 
     Raises:
         ScenarioError: There is no such link, or a table is not valid.
@@ -55,16 +54,16 @@ def complete_link_tables(
 def complete_link(
     written: TomlTable, common: TomlTable, name: str, files: NamedFiles, path: str
 ) -> TomlTable:
-    """Returns the complete table of a link, or of the delayed view of a site.
+    """Returns the complete table of a link, or of a site's delayed view of its peers.
 
     A view is the delay with which the user of a site sees the other arms. It has the keys of a
-    link, but does not inherit their values.
+    link but does not inherit their values.
 
     Args:
-        written: Table of the link as its author wrote it.
-        common: Common settings of all links, joined with their defaults. Empty for a view.
-        name: Name of the link, by which a log stores its delays.
-        files: Files of delays that the link may name.
+        written: The link table as written by its author.
+        common: Settings of all links, including defaults. Empty for a view.
+        name: Name under which a log stores the delays of the link.
+        files: Delay files that the link may name.
         path: Path of the table, for error messages.
 
     Raises:
@@ -87,24 +86,25 @@ def complete_link(
 
 
 def _join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
-    """Returns the settings of a link, completed with the settings that the link inherits.
+    """Completes the settings of a link with those that it inherits.
 
-    The source of settings that the author left out depends on what the author wrote:
+    The source of the missing settings depends on what the author wrote:
 
     - If the link names a preset, they are taken from the preset.
-    - If it names only a delay model, no other settings are inherited, because each model has
-      its own settings.
-    - Otherwise they are taken from the common settings of all links.
+    - If it names only a delay model, nothing is inherited, since each model has its own
+      settings.
+    - Otherwise, they are taken from the common settings of all links.
 
-    Files with recorded delays are not read here.
+    Delay traces are not read here.
 
     Args:
-        written: Settings of the link as the author wrote them.
-        common: Common settings of all links, completed.
+        written: Settings of the link as written by the author.
+        common: Complete common settings of all links.
         path: Path of the settings in the scenario, for error messages.
 
     Raises:
-        ScenarioError: There is no such preset, model or key, or the preset has another model.
+        ScenarioError: The preset, model or key does not exist, or the preset has a different
+            model.
     """
     defaults = {} if "model" in written else common
     if "preset" in written:
@@ -136,17 +136,17 @@ def _join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
 def change_link(written: TomlTable, name: str, current: TomlTable, path: str) -> TomlTable:
     """Returns the complete table of a link after a change during a run.
 
-    A change may neither read a file nor move the outages of the link. It may not replace one
-    table of recorded delays by another.
+    A change must not read a file, move the outages of the link, or replace one delay trace with
+    another.
 
     Args:
-        written: Table `to` of the change, with the keys that change.
+        written: Table `to` of the change, which contains the keys to change.
         name: Name of the link.
-        current: Complete tables of all links before the change, by name.
+        current: Mapping from link name to the complete table before the change.
         path: Path of the change, for error messages.
 
     Raises:
-        ScenarioError: There is no such link, or the change is not possible.
+        ScenarioError: There is no such link, or the change is not allowed.
     """
     if name not in current:
         names = list(current)

@@ -1,11 +1,9 @@
-"""Reads the files that a scenario names: descriptions of robots, and recorded delays of links.
+"""Reads the files named in a scenario: URDF files of arms and recorded delays of links.
 
-A scenario is a TOML file that describes an experiment. It may name URDF files, which describe
-robot arms, and files with the delays of a network. A complete scenario contains the texts of
-these files instead of their names.
+A complete scenario contains the contents of these files instead of their names.
 
 Invariant:
-    - Without a folder, no file may be named, because a scenario from a log or from another
+    - Files can be named only if a folder is given. A scenario from a log or from another
       computer must not read files on this computer.
 """
 
@@ -24,13 +22,13 @@ SHIPPED_FOLDER = resources.files("trilat_net") / "scenarios"
 
 
 class NamedFiles(NamedTuple):
-    """Files that a scenario names: the folder to search, and the robot descriptions (URDF).
+    """Files named in a scenario: the folder to search, and the contents of the URDF files.
 
-    Other files, such as tables of recorded delays, are read from the folder when needed.
+    Other files, such as delay traces, are read from the folder when needed.
 
     Attributes:
-        folder: Folder in which the files are searched. None refuses every file.
-        urdf_texts: Texts of the URDF files of the arms, by the name of the file.
+        folder: Folder in which files are looked up. If None, every file is rejected.
+        urdf_texts: Mapping from name to content of the arms' URDF files.
     """
 
     folder: Path | None
@@ -40,15 +38,16 @@ class NamedFiles(NamedTuple):
     def of_arms(
         cls, tables: TomlTable, embedded_texts: Mapping[str, str], folder: Path | None
     ) -> "NamedFiles":
-        """Reads the text of every URDF file that an arm of a scenario names.
+        """Reads every URDF file that an arm of a scenario names.
 
-        A text that the scenario itself contains has priority, then a file that the package
-        ships, then a file in `folder`.
+        A file embedded in the scenario takes precedence over a file shipped with the package,
+        which takes precedence over a file in `folder`.
 
         Args:
             tables: Tables of the scenario file.
-            embedded_texts: Table `urdf` of the scenario: texts by the name of their file.
-            folder: Folder in which the files are searched. None refuses every file.
+            embedded_texts: Table `urdf` of the scenario, a mapping from file name to content.
+            folder: Folder in which files are looked up. If None, a scenario that names a file
+                is rejected.
 
         Raises:
             ScenarioError: A file cannot be read, or no file may be named.
@@ -69,21 +68,21 @@ class NamedFiles(NamedTuple):
         return cls(folder, texts)
 
     def list_used_texts(self, sites: TomlTable) -> dict[str, str]:
-        """Returns the texts of the URDF files that complete sites use, by the name of the file.
+        """Returns a mapping from name to content of the URDF files that the sites use.
 
-        The file that `[arm]` names is not used if every site has its own arm.
+        A file named in `[arm]` is unused if every site has its own arm.
 
         Args:
-            sites: Complete tables of the sites, by name.
+            sites: Mapping from site name to the complete table of the site.
         """
         used_names = [site["arm"].get("urdf") for site in sites.values()]
         return {name: text for name, text in self.urdf_texts.items() if name in used_names}
 
     def read_trace(self, link: TomlTable, name: str, path: str) -> str:
-        """Returns the recorded delays of a link, from its table or from the file that it names.
+        """Returns the delay trace of a link, from its table or from the file that it names.
 
-        The file is a table of times and delays, or a log. From a log, the delays of the link
-        `of` are taken, by default the delays of the link with the same name.
+        The file is either a CSV file of times and delays, or a log. In a log, the delays of the
+        link `of` are read, by default those of the link called `name`.
 
         Args:
             link: Table of a link with the delay model "trace".
@@ -116,13 +115,13 @@ class NamedFiles(NamedTuple):
 
 
 def _read_urdf(name: str, folder: Path | None, path: str) -> str:
-    """Reads the text of a URDF file, the XML description of a robot.
+    """Reads a URDF file.
 
-    At most one character more than allowed is read, so that a huge file cannot fill the memory.
-    The parser then refuses the text as too long.
+    Reads at most one character more than allowed, so a huge file cannot fill the memory. The
+    parser then rejects the text as too long.
 
     Args:
-        name: Name of the file, as the arm names it.
+        name: Name of the file, as given in the arm table.
         folder: Folder of the scenario. If None, no file may be named.
         path: Path of the key that names the file, for error messages.
 
@@ -142,9 +141,9 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
 
 def _find_file(name: str, folder: Path) -> Path:
-    """Returns the path of a file that a scenario names, in the package or in the user's folder.
+    """Returns the path of a file named in a scenario, in the package or in the user's folder.
 
-    A file that the package ships has priority, but only for a name without a folder. The
+    A file shipped with the package takes precedence, but only for a name with no folder. The
     returned path need not exist.
     """
     shipped = Path(str(SHIPPED_FOLDER / name))
@@ -153,9 +152,9 @@ def _find_file(name: str, folder: Path) -> Path:
 
 
 def use_unix_line_ends(text: str) -> str:
-    r"""Returns a text with line feeds as line ends, as on Linux.
+    r"""Converts all line ends to line feeds.
 
-    A file that was written on Windows would otherwise count as a different experiment, because
-    its hash would differ.
+    A file written on Windows would otherwise have a different hash and count as a different
+    experiment.
     """
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -1,20 +1,19 @@
-"""Changes single keys of a scenario by overrides such as `control.Kd=5`.
+"""Applies overrides such as `control.Kd=5` to a scenario.
 
-A scenario is a TOML file that describes an experiment. Overrides change the tables of such a
-file, or a resolved scenario, in which every key of every site (the control process of an arm)
-and of every network link is written out.
+Overrides can be applied to the tables of a scenario file, or to a resolved scenario, in which
+every key of every site and link is written out.
 
 Invariant:
-    - In a resolved scenario, a key without the name of a site or link (`control.Kd`,
-      `link.delay_ms`, `rate_hz`) applies to every site or link that can have the key.
-    - A key of a single site or link (`sites.s.control.Kd`) has priority, regardless of the
-      order.
+    - In a resolved scenario, a key that names no site or link (`control.Kd`, `link.delay_ms`,
+      `rate_hz`) applies to every site or link that can have the key.
+    - A key of a single site or link (`sites.s.control.Kd`) takes precedence, whatever the order
+      of the overrides.
     - A key of `control` that no built-in law has is an argument of a user's control law.
 """
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import TomlTable
@@ -28,60 +27,161 @@ from .site_spec import SITE_GROUPS
 from .written_tables import TRACE_KEYS
 
 _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}
-"""Groups in which other keys depend on a kind, and the keys that name this kind."""
+"""Groups whose other keys depend on a kind, and the keys that select this kind."""
 _USER_LAW = "own"
-"""Kind of all control laws that users wrote."""
+"""Kind shared by all user-defined control laws."""
 
 _WRONG_VALUE = "expected "
-"""Beginning of the text about a value of a wrong type or range."""
+"""Prefix of messages about a value of a wrong type or range."""
 
 Override = tuple[str, Any]
-"""Dotted key and its new value."""
+"""Dotted key and new value."""
 
 
-def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Replaces an override for all sites or links by one override for each of them.
+class ScenarioOverrides(NamedTuple):
+    """Overrides of scenario keys, such as `control.Kd=5`, requested by a user.
 
-    An override replaces one value of a scenario, the description of an experiment. Groups are
-    all sites (the processes of the arms) or all links (the connections between them). For
-    example, an override of `control.K` becomes one override for each site whose control law has
-    a gain K.
-
-    Args:
-        scenario: The complete scenario.
-        pairs: The overrides. Each is a pair of a dotted key and a value.
-
-    Returns:
-        Values by the dotted key of a single site or link.
-
-    Raises:
-        ScenarioError: The key does not exist, or no site or link of the scenario can have it.
+    Attributes:
+        pairs: Dotted key and new value of each override.
     """
-    flat_pairs = _flatten_groups(pairs)
-    overridden = dict(flat_pairs)
-    group_values: dict[str, Any] = {}
-    single_values: dict[str, Any] = {}
-    for key, value in flat_pairs:
-        group, _, name = key.partition(".")
-        is_site_group = group in SITE_GROUPS and bool(name)
-        if is_site_group:
-            vector, _ = _split_entry(name)
-            first_key = vector.split(".")[0]
-            check_keys({first_key: value}, field_names(SITE_GROUPS[group]), group)
-        if is_site_group or key == "rate_hz":
-            group_values |= {f"sites.{site}.{key}": value for site in scenario.names}
-        elif group in _KIND_KEYS and name:
-            members = _expand_group(scenario, group, name, overridden)
-            group_values |= dict.fromkeys(members, value)
-        else:
-            single_values[_expand_single(scenario, key, overridden)] = value
-    return group_values | single_values
+
+    pairs: tuple[Override, ...]
+
+    @classmethod
+    def parse(cls, written: Mapping[str, Any] | Sequence[str]) -> "ScenarioOverrides":
+        """Parses overrides from the command line (KEY=VALUE) or from a Python mapping.
+
+        Args:
+            written: A mapping from dotted key to value, or strings of the form KEY=VALUE, where
+                VALUE is a TOML value or a bare word.
+
+        Raises:
+            ScenarioError: A string is not of the form KEY=VALUE.
+        """
+        if isinstance(written, Mapping):
+            return cls(tuple(name_law_classes(written).items()))
+        pairs = []
+        for text in written:
+            pair = split_assignment(str(text))
+            if pair is None:
+                raise ScenarioError(
+                    "an override must have the form KEY=VALUE, as in control.Kd=5, not "
+                    f"{text!r}{hint_at_quotes(str(text))}"
+                )
+            pairs.append(pair)
+        return cls(tuple(pairs))
+
+    def expand(self, scenario: Scenario) -> "ScenarioOverrides":
+        """Expands each override of a group into one override per site or link.
+
+        A group is either all sites or all links. For example, an override of `control.K`
+        becomes one override for each site whose control law has a gain K.
+
+        Args:
+            scenario: The complete scenario.
+
+        Returns:
+            Overrides with the dotted keys of individual sites and links.
+
+        Raises:
+            ScenarioError: The key does not exist, or no site or link of the scenario can have
+                it.
+        """
+        flat_pairs = _flatten_groups(self.pairs)
+        overridden = dict(flat_pairs)
+        group_values: dict[str, Any] = {}
+        single_values: dict[str, Any] = {}
+        for key, value in flat_pairs:
+            group, _, name = key.partition(".")
+            is_site_group = group in SITE_GROUPS and bool(name)
+            if is_site_group:
+                vector, _ = _split_entry(name)
+                first_key = vector.split(".")[0]
+                check_keys({first_key: value}, field_names(SITE_GROUPS[group]), group)
+            if is_site_group or key == "rate_hz":
+                group_values |= {f"sites.{site}.{key}": value for site in scenario.names}
+            elif group in _KIND_KEYS and name:
+                members = _expand_group(scenario, group, name, overridden)
+                group_values |= dict.fromkeys(members, value)
+            else:
+                single_values[_expand_single(scenario, key, overridden)] = value
+        return ScenarioOverrides(tuple((group_values | single_values).items()))
+
+    def split_entries(
+        self, tables: TomlTable
+    ) -> tuple["ScenarioOverrides", "ScenarioOverrides"]:
+        """Separates the overrides that can be applied to an incomplete scenario from the rest.
+
+        An override of a single list entry, such as the stiffness of joint 2, cannot be applied
+        if the list is missing because its author wrote one number for all joints or omitted the
+        setting. Such overrides must wait until the scenario has been completed.
+
+        Args:
+            tables: Tables of the scenario file.
+
+        Returns:
+            The overrides that can be applied now, and those that must wait.
+        """
+        applicable = []
+        waiting = []
+        for key, value in self.pairs:
+            vector, entry = _split_entry(key)
+            if not entry or isinstance(_find_value(tables, vector), list):
+                applicable.append((key, value))
+            else:
+                waiting.append((key, value))
+        return ScenarioOverrides(tuple(applicable)), ScenarioOverrides(tuple(waiting))
+
+    def apply_to(self, tables: TomlTable) -> None:
+        """Applies the overrides to the tables of a scenario file.
+
+        A number in a key is a list index that starts at 0, as in
+        sites.s.environment.0.stiffness_n_m. Setting a key that selects a kind (the model or
+        preset of a link, a law, the URDF file of an arm) removes the other keys of its table,
+        which belong to the previous kind.
+
+        Args:
+            tables: Tables of the scenario file, modified in place.
+
+        Raises:
+            ScenarioError: The key of an override does not exist.
+        """
+        overridden_keys = {key for key, _ in self.pairs}
+        for key, value in self.pairs:
+            *parents, last = key.split(".")
+            _check_site_exists(tables, parents, key)
+            table = _reach_table(tables, parents, last)
+            if isinstance(table, list):
+                table[_list_index(table, last, key)] = value
+                continue
+            if last in _list_kind_keys(parents):
+                for other in list(table):
+                    if ".".join([*parents, other]) not in overridden_keys:
+                        del table[other]
+            table[last] = value
+
+    def nest(self) -> TomlTable:
+        """Returns the overrides as nested tables, as in a scenario file.
+
+        `find_written_path` searches these tables for the key of an error.
+        """
+        tables: TomlTable = {}
+        for key, value in self.pairs:
+            *parents, last = key.split(".")
+            table = tables
+            for name in parents:
+                inner = table.setdefault(name, {})
+                if not isinstance(inner, dict):
+                    inner = table[name] = {}
+                table = inner
+            table[last] = value
+        return tables
 
 
 def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
-    """Replaces each override of a whole group of keys by overrides of the single keys.
+    """Replaces each override of a group of keys with overrides of the individual keys.
 
-    For example, `limits={q_max_rad=3}` becomes `limits.q_max_rad=3`, so that other keys of the
+    For example, `limits={q_max_rad=3}` becomes `limits.q_max_rad=3`, so the other keys of the
     group keep their values.
     """
     flat_pairs: list[Override] = []
@@ -95,9 +195,9 @@ def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
 
 
 def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) -> str:
-    """Returns the complete path of an overridden key that belongs to a single arm or link.
+    """Returns the complete path of an overridden key of a single site or link.
 
-    A key of a user's control law is an argument of its class, and gets the path of this
+    A key of a user's control law is an argument of its class, and is given the path of this
     argument.
     """
     group, _, rest = key.partition(".")
@@ -109,7 +209,7 @@ def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) 
 
 
 def _user_law_key(path: str, name: str) -> str:
-    """Returns the complete path of an overridden key that belongs to a user's control law.
+    """Returns the complete path of an overridden key of a user's control law.
 
     Keys that the scenario itself does not define are arguments of the user's class.
     """
@@ -120,7 +220,7 @@ def _user_law_key(path: str, name: str) -> str:
 def _expand_group(
     scenario: Scenario, group: str, name: str, overridden: Mapping[str, Any]
 ) -> list[str]:
-    """Returns the paths of a key of a group, one for each law or link that can have the key.
+    """Returns the paths of a group key, one for each law or link that can have the key.
 
     Whether a law or link can have the key depends on its kind after the overrides.
 
@@ -128,7 +228,7 @@ def _expand_group(
         scenario: The scenario.
         group: "control" or "link".
         name: Key in the group.
-        overridden: All overrides, by key.
+        overridden: Mapping from key to value of all overrides.
 
     Raises:
         ScenarioError: No law or link can have the key.
@@ -173,13 +273,13 @@ def _expand_group(
 def _list_group_kinds(
     scenario: Scenario, group: str, overridden: Mapping[str, Any]
 ) -> tuple[dict[str, str], dict[str, tuple[str, ...]]]:
-    """Returns the control laws (or delay models) of all arms (or links) after the overrides.
+    """Returns the laws (or delay models) in use after the overrides, and the keys of each.
 
-    For each of these kinds, it also returns the keys that the kind has. An override of all arms
-    applies only where the law has the key.
+    An override for all sites applies only where the law has the key.
 
     Returns:
-        Kinds by the path of the law or link, and keys by the built-in kind.
+        Mapping from the path of each law or link to its kind, and mapping from built-in kind to
+        its keys.
     """
     if group == "control":
         laws = {}
@@ -196,11 +296,11 @@ def _list_group_kinds(
 
 
 def _split_entry(key: str) -> tuple[str, str]:
-    """Splits the key of an entry of a list into the name and the index, as in "q0_rad.1".
+    """Splits the key of a list entry into name and index, as in "q0_rad.1".
 
     Returns:
-        Key of the list, and number of the entry as a string. For other keys, the key itself and
-        an empty text.
+        Key of the list, and index of the entry as a string. For other keys, the key itself and
+        an empty string.
     """
     vector, _, entry = key.rpartition(".")
     if vector and entry.isdecimal():
@@ -208,40 +308,10 @@ def _split_entry(key: str) -> tuple[str, str]:
     return key, ""
 
 
-def split_entries(
-    tables: TomlTable, pairs: Sequence[Override]
-) -> tuple[dict[str, Any], list[Override]]:
-    """Separates overrides that can be applied to a scenario file at once from all others.
-
-    An override replaces one value of a scenario, the description of an experiment. Some
-    overrides replace one entry of a list, such as the stiffness of joint 2. The file may lack
-    this list, because its author wrote one number for all joints or left the setting out. These
-    overrides must wait until the scenario has been completed with all lists.
-
-    Args:
-        tables: Content of the scenario file.
-        pairs: The overrides. Each is a pair of a dotted key, such as `control.K.1`, and a
-            value.
-
-    Returns:
-        The overrides that can be applied now, as values by key, and the overrides that must
-        wait.
-    """
-    applicable = {}
-    waiting = []
-    for key, value in pairs:
-        vector, entry = _split_entry(key)
-        if not entry or isinstance(_find_value(tables, vector), list):
-            applicable[key] = value
-        else:
-            waiting.append((key, value))
-    return applicable, waiting
-
-
 def _find_value(tables: TomlTable, key: str) -> Any:
-    """Returns the value of a scenario at a dotted key, in which a number is an index of a list.
+    """Returns the value at a dotted key of a scenario, where a number is a list index.
 
-    The result is None if the scenario has no such value.
+    Returns None if there is no such value.
     """
     value: Any = tables
     for name in key.split("."):
@@ -255,7 +325,7 @@ def _find_value(tables: TomlTable, key: str) -> Any:
 
 
 def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
-    """Returns the name of an arm's control law after the overrides."""
+    """Returns the name of a site's control law after the overrides."""
     for path in (f"sites.{site}.control.law", "control.law"):
         if path in overridden:
             return overridden[path]
@@ -265,7 +335,7 @@ def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> A
 def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) -> Any:
     """Returns the name of a link's delay model after the overrides.
 
-    An unknown model or preset is refused later, when the tables are resolved.
+    An unknown model or preset is rejected later, when the tables are resolved.
     """
     for path in (f"links.{link}", "link"):
         if f"{path}.model" in overridden:
@@ -276,39 +346,8 @@ def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) ->
     return scenario.links[link].__struct_config__.tag
 
 
-def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[str]) -> None:
-    """Replaces single values in the tables of a scenario file.
-
-    A number in a key is the index of an entry of a list, counted from 0, as in
-    sites.s.environment.0.stiffness_n_m. A key that names a kind (the model or preset of a link,
-    a law, the URDF file of an arm) removes the other keys of its table, because they belong to
-    the previous kind.
-
-    Args:
-        tables: Tables of the scenario file. They are changed in place.
-        overrides: Values by dotted key, or texts KEY=VALUE.
-
-    Raises:
-        ScenarioError: An override does not have the form KEY=VALUE, or its key does not exist.
-    """
-    pairs = parse_overrides(overrides)
-    overridden_keys = {key for key, _ in pairs}
-    for key, value in pairs:
-        *parents, last = key.split(".")
-        _check_site_exists(tables, parents, key)
-        table = _reach_table(tables, parents, last)
-        if isinstance(table, list):
-            table[_list_index(table, last, key)] = value
-            continue
-        if last in _list_kind_keys(parents):
-            for other in list(table):
-                if ".".join([*parents, other]) not in overridden_keys:
-                    del table[other]
-        table[last] = value
-
-
 def _list_kind_keys(parents: Sequence[str]) -> list[str]:
-    """Returns the keys that choose a kind in the table at a path, such as `law` or `model`.
+    """Returns the keys that select a kind in the table at a path, such as `law` or `model`.
 
     If an override changes such a key, the other keys of the table belong to the previous kind
     and are removed.
@@ -322,13 +361,13 @@ def _list_kind_keys(parents: Sequence[str]) -> list[str]:
 
 
 def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> None:
-    """Refuses an override of a key of an arm that the scenario does not have.
+    """Raises ScenarioError if an override names a site that the scenario does not have.
 
-    Otherwise a misspelt name would add a new arm.
+    Otherwise, a misspelt name would add a new site.
 
     Args:
         tables: Tables of the scenario.
-        parents: Keys of the path, without the last one.
+        parents: Keys of the path, excluding the last.
         key: The complete key, for the error message.
     """
     sites = tables.get("sites")
@@ -341,13 +380,12 @@ def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> N
 
 
 def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTable | list[Any]:
-    """Returns the table or list that contains an overridden key, and adds it if it is missing.
+    """Returns the table or list that contains an overridden key, creating it if necessary.
 
     Args:
         tables: Tables of the scenario.
         parents: Keys of the path.
-        last: Key in the table or list. If this key is a number, a list is added, otherwise a
-            table.
+        last: Key in the table or list. If it is a number, a list is created, otherwise a table.
 
     Raises:
         ScenarioError: A value stands in place of a table, or a list has no such entry.
@@ -369,11 +407,11 @@ def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTa
 
 
 def _list_index(entries: list[Any], name: str, path: str) -> int:
-    """Returns the index that a part of an overridden key states, after a check of the range.
+    """Parses a list index in an overridden key, and checks its range.
 
     Args:
         entries: The list.
-        name: Index as a string.
+        name: The index as a string.
         path: Path of the entry, for the error message.
 
     Raises:
@@ -387,49 +425,22 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
     return int(name)
 
 
-def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
-    """Converts overrides of a scenario, as a user wrote them, to pairs of key and value.
-
-    An override replaces one value of a scenario, the description of an experiment. A user
-    writes KEY=VALUE on the command line, or a mapping in Python.
-
-    Args:
-        overrides: Values by dotted key, or texts KEY=VALUE. The value of a text is written as
-            in TOML, or as a bare word.
-
-    Raises:
-        ScenarioError: A text does not have the form KEY=VALUE.
-    """
-    if isinstance(overrides, Mapping):
-        return list(name_law_classes(overrides).items())
-    pairs = []
-    for text in overrides:
-        pair = split_assignment(str(text))
-        if pair is None:
-            raise ScenarioError(
-                "an override must have the form KEY=VALUE, as in control.Kd=5, not "
-                f"{text!r}{hint_at_quotes(str(text))}"
-            )
-        pairs.append(pair)
-    return pairs
-
-
 def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
     """Returns the path of a wrong key as its author wrote it.
 
     The author may have set the key for all sites or links at once. For example, the path
-    "links.m2->m1.delay_ms" becomes "link.delay_ms" if only that key was written. Values of a
-    wrong type or range are wrong for every site or link, and so is a URDF file that cannot be
-    used. Other errors, such as a list of the wrong length, may concern only the site in their
-    path, so these paths are kept.
+    "links.m2->m1.delay_ms" becomes "link.delay_ms" if only that key was written. This applies
+    to values of a wrong type or range and to unusable URDF files, which affect every site or
+    link equally. Other errors, such as a list of the wrong length, may affect only one site, so
+    their path is kept.
 
     Args:
-        error: The error, with the path of the key of a single site or link. An index in square
-            brackets may follow.
+        error: An error whose path names a single site or link, possibly followed by an index in
+            square brackets.
         tables: Tables with the keys that the author wrote.
 
     Returns:
-        The path of the written key. The path of the error if no such key was written.
+        Path of the written key, or the path of the error if no such key was written.
     """
     path = error.path
     key, bracket, index = path.partition("[")
@@ -460,37 +471,16 @@ def find_written_path(error: ScenarioError, tables: TomlTable) -> str:
     return path
 
 
-def nest_overrides(pairs: Sequence[Override]) -> TomlTable:
-    """Returns overrides with dotted keys as nested tables, as in a scenario file.
-
-    `find_written_path` searches these tables for the key of an error.
-
-    Args:
-        pairs: Dotted keys and their values.
-    """
-    tables: TomlTable = {}
-    for key, value in pairs:
-        *parents, last = key.split(".")
-        table = tables
-        for name in parents:
-            inner = table.setdefault(name, {})
-            if not isinstance(inner, dict):
-                inner = table[name] = {}
-            table = inner
-        table[last] = value
-    return tables
-
-
 def split_assignment(text: str) -> Override | None:
-    """Splits a text KEY=VALUE, as given to the option --set, into its key and its value.
+    """Splits a string KEY=VALUE, as given to the option --set, into key and value.
 
-    For example, "links.delay_ms=5" gives the key "links.delay_ms" and the value 5.
+    For example, "links.delay_ms=5" yields the key "links.delay_ms" and the value 5.
 
     Args:
-        text: The text. A value that is not valid TOML is treated as a string without quotes.
+        text: The string. A value that is not valid TOML is treated as an unquoted string.
 
     Returns:
-        The key and the value. None if the text does not have this form.
+        Key and value, or None if the string is not of this form.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():

@@ -1,12 +1,11 @@
-"""Reads the part of a scenario that names a user's control law, a Python class.
+"""Reads the scenario table of a control law that is a user's Python class.
 
-A scenario is a TOML file that describes an experiment. The law of an arm is chosen in the table
-`control`, for example by
+The law of an arm is selected in the table `control`, for example by
 
     control = { law = "my_law:Spring", stiffness = 5 }
 
 Invariant:
-    - The file of the class is read, but not executed.
+    - The file of the class is read but not executed.
 """
 
 import re
@@ -19,21 +18,20 @@ from ..own_code import CLASS_PATTERN, read_code, read_sends
 
 
 def complete_own_law(code: str, written: TomlTable, common: TomlTable, path: str) -> TomlTable:
-    """Returns the complete table of a control law that a user wrote as a Python class.
+    """Returns the complete table of a control law that is a user's Python class.
 
     The table contains the name of the class, the hash of its file, and the vectors that the law
-    sends to other arms.
+    sends to peers.
 
     Args:
         code: Module and class, for example "package.module:Law".
-        written: Table `control` of the site. Apart from the key `law`, it contains the
-            arguments of the class.
+        written: Table `control` of the site: the key `law` and the arguments of the class.
         common: Table `control` for all sites. Its arguments apply if it names the same class.
         path: Path of the table, for error messages.
 
     Raises:
         ScenarioError: The name is not valid, the file cannot be read, or the table contains a
-            key that it must not have.
+            key that is not allowed.
     """
     if not re.fullmatch(CLASS_PATTERN, code):
         problem = f"must have the form package.module:Law, but is {code!r}"

@@ -1,11 +1,11 @@
-"""Reads the part of a scenario that names a user's simulation of an arm, called a plant.
+"""Reads the scenario table of a plant: a user's own simulation of an arm.
 
-A plant is a class that computes the motion of an arm and of other bodies, in place of the
-built-in simulation. The author of an experiment names the class:
+A plant is a class that computes the motion of an arm, and possibly of other bodies, in place of
+the built-in simulation. The scenario names the class:
 
     plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2 }
 
-`plant_player` runs the plants of a scenario.
+See `plant_player` for running the plants of a scenario.
 """
 
 import re
@@ -21,23 +21,21 @@ from .key_checks import is_number
 
 _BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")
 _MAX_BODIES = 32
-"""Largest number of bodies that a plant moves in addition to its arm."""
+"""Maximum number of bodies that a plant moves in addition to its arm."""
 _MAX_SIZE_M = 100.0
 """Largest extent of a body, in m."""
 
 
 class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True):
-    """Table of a scenario that names a user's arm model (plant).
-
-    The model is a Python class, which computes the motion of the arm from its torques.
+    """Scenario table of a plant: a user's Python class that computes the motion of an arm.
 
     Attributes:
         code: Class of the plant, for example "my_plant:Scene".
-        source_sha256: SHA-256 hash of the file of the class.
-        bodies: Bodies that the plant moves in addition to the arm. For each name, the extents
-            along the body's own axes x, y and z of a box around it, in m. Their poses are
-            recorded and drawn.
-        settings: Arguments of the class, by name.
+        source_sha256: SHA-256 hash of the file that contains the class.
+        bodies: Mapping from name to size of the bodies that the plant moves in addition to the
+            arm. The size is that of a box around the body along its own axes x, y and z, in m.
+            Their poses are recorded and drawn.
+        settings: Mapping from name to value of the constructor arguments of the class.
     """
 
     method: ClassVar[str] = "step"
@@ -47,55 +45,56 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
     bodies: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
 
+    @staticmethod
+    def complete_table(written: Any, path: str) -> Any:
+        """Completes the `plant` setting of a site.
 
-def resolve_plant(written: Any, path: str) -> Any:
-    """Completes the settings of a user's plant in a scenario.
+        The result contains the SHA-256 hash of the file of the class, the constructor arguments
+        of the class, and the sizes of the bodies.
 
-    A plant is a user's Python class that computes the motion of an arm, and of bodies such as a
-    box that it moves. The result contains the SHA-256 hash of the file with the class, the
-    arguments of the class, and the sizes of the bodies.
+        Args:
+            written: Value of the key `plant` as written by its author: a class name such as
+                "my_plant:Scene", or a table.
+            path: Path of the key, for error messages.
 
-    Args:
-        written: Value of the key `plant` as the author of the scenario wrote it: a class name,
-            as in "my_plant:Scene", or a table.
-        path: Path of the key, for error messages.
+        Returns:
+            The completed table. A string that is not a class name, such as "external", or a
+            value of a wrong type is returned unchanged.
 
-    Returns:
-        The completed table. A text that is not a class name, such as "external", and a value of
-        a wrong type are returned unchanged.
+        Raises:
+            ScenarioError: The class is missing, its file cannot be read, or the size of a body
+                is not valid.
+        """
+        table = written
+        if isinstance(written, str) and ":" in written:
+            table = {"class": written}
+        if not isinstance(table, Mapping):
+            return written
+        code = table.get("class")
+        if not isinstance(code, str):
+            raise ScenarioError("must be a class, as in 'my_plant:Scene'", path=f"{path}.class")
+        bodies = {}
+        if "bodies" in table:
+            bodies["bodies"] = _check_bodies(table["bodies"], f"{path}.bodies")
+        # A table with a hash has been resolved before.
+        if "source_sha256" in table:
+            return {**table, **bodies}
 
-    Raises:
-        ScenarioError: The class is missing, its file cannot be read, or the size of a body is
-            not valid.
-    """
-    table = written
-    if isinstance(written, str) and ":" in written:
-        table = {"class": written}
-    if not isinstance(table, Mapping):
-        return written
-    code = table.get("class")
-    if not isinstance(code, str):
-        raise ScenarioError("must be a class, as in 'my_plant:Scene'", path=f"{path}.class")
-    bodies = {}
-    if "bodies" in table:
-        bodies["bodies"] = _check_bodies(table["bodies"], f"{path}.bodies")
-    # A table with a hash has been resolved before.
-    if "source_sha256" in table:
-        return {**table, **bodies}
-
-    settings = {key: value for key, value in table.items() if key not in ("class", "bodies")}
-    return {
-        "class": code,
-        "source_sha256": read_code(code, path).sha256,
-        "settings": settings,
-        **bodies,
-    }
+        settings = {
+            key: value for key, value in table.items() if key not in ("class", "bodies")
+        }
+        return {
+            "class": code,
+            "source_sha256": read_code(code, path).sha256,
+            "settings": settings,
+            **bodies,
+        }
 
 
 def _check_bodies(written: Any, path: str) -> Any:
-    """Checks the names and sizes of the bodies that a user's arm model moves, such as a box.
+    """Validates the names and sizes of the bodies that a plant moves in addition to the arm.
 
-    The table is returned unchanged if it is valid.
+    Returns the table unchanged if it is valid.
 
     Raises:
         ScenarioError: There are too many bodies, or a name or extent is not valid.
@@ -121,7 +120,7 @@ def _check_bodies(written: Any, path: str) -> Any:
 
 
 def _is_box_size(size: Any) -> bool:
-    """Returns True for a list of three lengths in m that a body of the scene may have."""
+    """Returns True for a list of three lengths in m that are valid for a body."""
     if not isinstance(size, list | tuple) or len(size) != 3:
         return False
     return all(is_number(length) and 0.0 < length <= _MAX_SIZE_M for length in size)

@@ -1,7 +1,7 @@
-"""Reads the output of `ping`: when each probe was sent, and how long its round trip took.
+"""Parses the output of `ping`: when each probe was sent and how long its round trip took.
 
-A probe is one packet that `ping` sends to measure the round trip. The formats of iputils, BSD,
-macOS, busybox, fping and Windows are supported:
+A probe is one packet that `ping` sends. The formats of iputils, BSD, macOS, busybox, fping and
+Windows are supported:
 
     64 bytes from 192.0.2.5: icmp_seq=6 ttl=64 time=5.00 ms           iputils, BSD, macOS
     64 bytes from 192.0.2.5: seq=0 ttl=64 time=3.000 ms               busybox
@@ -9,13 +9,13 @@ macOS, busybox, fping and Windows are supported:
     192.0.2.5 : [0], 64 bytes, 5.00 ms (5.00 avg, 0% loss)            fping
 
 Invariant:
-    - A probe without an answer counts as lost, even before the first answer and after the last
-      one. The sent probes are derived from the sequence numbers, from lines about missing
-      answers, and from the number of packets in the summary at the end.
+    - A probe with no reply counts as lost, even before the first reply or after the last. The
+      list of probes sent is derived from the sequence numbers, from lines about missing
+      replies, and from the packet count in the final summary.
     - Only numbers and units are read, so the language of the program does not matter. A decimal
       comma is read as a decimal point.
-    - Output that contradicts its own summary is refused. If the output does not show how the
-      measurement began or ended, the result records this fact.
+    - Output that contradicts its own summary is rejected. If the output does not show how the
+      measurement began or ended, this is recorded in the result.
 """
 
 import math
@@ -30,20 +30,20 @@ from ..core import Array
 from ..errors import count_nouns
 
 _SEQUENCE_NUMBERS = 2**16
-"""Number of probes after which `ping` counts from 0 again."""
+"""Number of probes after which `ping` restarts its sequence numbers at 0."""
 _MAX_PROBES = 2**24
-"""Largest number of probes that a summary may count: 194 days at one probe per second."""
+"""Maximum number of probes in a summary: 194 days at one probe per second."""
 
 _NUMBER = re.compile(r"(?:\bicmp_(?:seq|req)|\bseq)[= ]\s*(\d+)\b")
 """Matches the sequence number of a probe."""
 _ROUND_TRIP = re.compile(r"[=<]\s?(\d+(?:[.,]\d+)?)\s?ms?\b")
 """Matches the round-trip time. Spanish Windows prints "tiempo<1m", French "temps=21 ms"."""
 _STAMP = re.compile(r"\[(\d+[.,]\d+)\]")
-"""Matches the time at which a line was printed, with the option -D."""
+"""Matches the time at which a line was printed, as added by the option -D."""
 _HEADER = re.compile(r"ping6?\b.*\d", re.IGNORECASE)
 """Matches the first line of a run."""
 _COUNTS_FROM_0 = re.compile(r": \d+ \w+ \w+|=\d+\+\d+")
-"""Matches the headers of busybox, BSD and macOS, whose sequence numbers start from 0.
+"""Matches the headers of busybox, BSD and macOS, whose sequence numbers start at 0.
 
 Examples: "PING host (192.0.2.5): 56 data bytes", "PING6(56=40+8+8 bytes) ...".
 """
@@ -54,28 +54,28 @@ _SUMMARY = re.compile(r"\s*(\d+) [^\d,]+, (\d+)\b.*%")
 _FPING = re.compile(
     r"(?:\[(\d+[.,]\d+)\] )?(\S+)\s+: \[(\d+)\], (?:\d+ bytes, (\d+(?:[.,]\d+)?) ms)?"
 )
-"""Matches a line of `fping`: time of printing, host, sequence number and round trip."""
+"""Matches a line of `fping`: timestamp, host, sequence number and round trip."""
 _FPING_SUMMARY = re.compile(r"\S+\s+: \S+ = (\d+)/(\d+)/\d+%")
 """Matches, for example, "192.0.2.5 : xmt/rcv/%loss = 3/3/0%"."""
 
 _WINDOWS_REPLY = re.compile(
     r"[=<]\s?\d+\s?ms?\b.*\bTTL=\d+|^\D*[\w.:%]+: \w+[=<]\d+\s?ms?\s*$", re.IGNORECASE
 )
-"""Matches an answer. Those of IPv6 have no TTL: "Reply from 2001:db8::1: time=21ms"."""
+"""Matches a reply. IPv6 replies have no TTL: "Reply from 2001:db8::1: time=21ms"."""
 _WINDOWS_COUNTS = re.compile(r"[^=]*=\s*(\d+),[^=\d]+=\s*(\d+),[^=\d]+=\s*(\d+)\s*(?:[(,]|$)")
 """Matches, for example, "Packets: Sent = 30, Received = 29, Lost = 1 (3% loss)"."""
 _WINDOWS_BREAK = re.compile(r"\^C|\S+[-+]C")
-"""Matches the line after the user has interrupted the program, such as "Control-C"."""
+"""Matches the line printed after the user interrupts the program, such as "Control-C"."""
 
 _SEVERAL_RUNS = "the output contains several runs of ping: import each run separately"
 
 
 class _PingProbes(NamedTuple):
-    """Round trips that one run of the program `ping` measured, in the order of sending.
+    """Round trips measured by one run of `ping`, in the order of sending.
 
     Attributes:
         sent_s: Time at which each probe was sent, in s. The zero of the clock is arbitrary.
-        rtt_ms: Round-trip time of each probe, in ms. Infinite if there was no answer.
+        rtt_ms: Round-trip time of each probe, in ms; infinite if there was no reply.
         begin_known: False if earlier probes may be missing from the output.
         end_known: False if later probes may be missing from the output.
     """
@@ -87,12 +87,12 @@ class _PingProbes(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Answer to one probe (request packet) that the program `ping` received.
+    """Reply to one probe, as received by `ping`.
 
     Attributes:
         rtt_ms: Round-trip time, in ms.
-        printed_s: Time at which the line of the answer was printed, in s. None if the line does
-            not contain a time.
+        printed_s: Time at which the reply was printed, in s, or None if the line has no
+            timestamp.
     """
 
     rtt_ms: float
@@ -100,24 +100,24 @@ class _Answer(NamedTuple):
 
 
 class _Summary(NamedTuple):
-    """Counts that `ping` prints at the end of its output: sent packets and received answers."""
+    """Counts in the summary printed by `ping`: packets sent and replies received."""
 
     sent: int
     received: int
 
 
 def read_ping(text: str, every_s: float) -> _PingProbes:
-    """Reads the round trips from the output of one run of `ping` or `fping`.
+    """Parses the output of a single run of `ping` or `fping`.
 
-    The program that produced the output is recognised by its lines.
+    The program that produced the output is detected automatically.
 
     Args:
-        text: Text that the program printed.
-        every_s: Interval between probes, in s. It is used if the lines do not contain times.
+        text: Output of the program.
+        every_s: Interval between probes, in s. Used if the output contains no timestamps.
 
     Raises:
         ValueError: The text is not the output of `ping`, contains several runs, or contradicts
-            its summary.
+            its own summary.
     """
     lines = [line.rstrip() for line in text.splitlines()]
     if any(_NUMBER.search(line) for line in lines):
@@ -138,20 +138,20 @@ def read_ping(text: str, every_s: float) -> _PingProbes:
 
 
 def _parse_summary(pattern: re.Pattern[str], line: str) -> _Summary | None:
-    """Reads the counts from a line of output, or returns None if it is not the summary line."""
+    """Parses the counts in a line of output, or returns None if it is not the summary line."""
     match = pattern.match(line)
     return None if match is None else _Summary(int(match[1]), int(match[2]))
 
 
 def _read_numbered(lines: Sequence[str], every_s: float) -> _PingProbes:
-    """Returns the probes of a program that prints the sequence number of each probe.
+    """Parses the output of programs that print the sequence number of each probe.
 
-    A line with a sequence number and a round-trip time is an answer. A line with a sequence
-    number alone reports that the answer is missing.
+    A line with a sequence number and a round-trip time is a reply. A line with a sequence
+    number alone reports a missing reply.
 
     Args:
         lines: Lines of the output.
-        every_s: Interval between probes, in s, if the lines do not contain times.
+        every_s: Interval between probes, in s, if the output has no timestamps.
     """
     answers: dict[int, _Answer] = {}
     mentioned: set[int] = set()
@@ -188,13 +188,13 @@ def _read_numbered(lines: Sequence[str], every_s: float) -> _PingProbes:
 
 
 def _unwrap_number(previous: int, number: int) -> int:
-    """Returns the sequence number that `ping` would print if it never restarted from 0.
+    """Returns the sequence number that `ping` would print if it never restarted at 0.
 
-    The result is the number nearest to the previous one that agrees with the printed number
-    modulo `_SEQUENCE_NUMBERS`.
+    This is the number closest to the previous one that agrees with the printed number modulo
+    `_SEQUENCE_NUMBERS`.
 
     Args:
-        previous: Unwrapped number of the previous line. -1 if this is the first line.
+        previous: Unwrapped number of the previous line, or -1 for the first line.
         number: Printed number.
     """
     if previous < 0:
@@ -204,18 +204,18 @@ def _unwrap_number(previous: int, number: int) -> int:
 
 
 def _parse_decimal(text: str) -> float:
-    """Converts a text to a number. The decimal separator may be a comma."""
+    """Converts a string to a number. The decimal separator may be a comma."""
     return float(text.replace(",", "."))
 
 
 def _read_fping(lines: Sequence[str], every_s: float) -> _PingProbes:
-    """Reads the round trips from the output of `fping`, which numbers the probes from 0.
+    """Parses the output of `fping`, which numbers the probes from 0.
 
-    In contrast to `ping`, the numbers never restart from 0.
+    Unlike those of `ping`, its numbers never restart at 0.
 
     Args:
         lines: Lines of the output.
-        every_s: Interval between probes, in s, if the lines do not contain times.
+        every_s: Interval between probes, in s, if the output has no timestamps.
 
     Raises:
         ValueError: The output contains probes to several hosts.
@@ -255,15 +255,16 @@ def _arrange_probes(
     summary: _Summary | None,
     every_s: float,
 ) -> _PingProbes:
-    """Returns all probes of a run of `ping` in the order of sending, including the lost ones.
+    """Returns all probes of a run of `ping` in the order of sending, including lost ones.
 
     Args:
-        answers: Answers, by the number of the probe.
-        mentioned: All numbers in the output, including those of lines about missing answers.
-        first: Number of the first probe, as the header or the summary shows. None if the output
-            does not show it.
-        summary: Numbers in the summary. None if there is no summary.
-        every_s: Interval between probes, in s, if the lines do not contain times.
+        answers: Mapping from probe number to reply.
+        mentioned: All probe numbers in the output, including those in lines about missing
+            replies.
+        first: Number of the first probe according to the header or summary, or None if the
+            output does not show it.
+        summary: Counts in the summary, or None if there is no summary.
+        every_s: Interval between probes, in s, if the output has no timestamps.
 
     Raises:
         ValueError: The lines contradict the summary, or the summary counts too many packets.
@@ -307,15 +308,14 @@ def _find_sending_times(
 ) -> Array:
     """Estimates when each probe was sent.
 
-    `ping` prints the time at which it prints the line of an answer. The probe was sent one
-    round trip earlier. The times of probes without an answer are interpolated between two
-    answers. Before the first answer and after the last one, they are extrapolated with the mean
-    interval.
+    `ping` prints the time of each reply, and the probe was sent one round trip earlier. The
+    times of probes with no reply are interpolated between replies. Before the first reply and
+    after the last, they are extrapolated using the mean interval.
 
     Args:
         numbers: Numbers of all probes.
-        answers: Answers, by the number of the probe.
-        every_s: Interval between probes, in s. It is used if a line does not contain a time.
+        answers: Mapping from probe number to reply.
+        every_s: Interval between probes, in s, used if a line has no timestamp.
 
     Returns:
         The times in s, in the order of `numbers`.
@@ -344,11 +344,11 @@ def _find_sending_times(
 
 
 def _read_windows(lines: Sequence[str], every_s: float) -> _PingProbes:
-    """Returns the probes in the output of Windows, which prints no sequence numbers.
+    """Parses the output of `ping` on Windows, which prints no sequence numbers.
 
-    The output has a header that ends in a colon, one line per probe, and then the summary,
-    whose first line ends in a colon as well. A line about a missing answer is a sentence in the
-    language of the user, and is recognised by its full stop.
+    The output consists of a header that ends in a colon, one line per probe, and a summary
+    whose first line also ends in a colon. A missing reply is reported as a sentence in the
+    user's language, which is recognised by its full stop.
 
     Args:
         lines: Lines of the output.

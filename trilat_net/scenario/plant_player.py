@@ -1,14 +1,14 @@
-"""Runs a user's simulation of an arm and of other bodies, called a plant.
+"""Runs plants: users' own simulations of an arm and of other bodies.
 
-A plant, for example a physics engine with objects to grasp, takes the place of the built-in
-simulation. In each control period, it receives the torque of the control law and returns the
-new state of the arm.
+A plant, for example a physics engine with objects to grasp, replaces the built-in simulation.
+In each control period, it receives the torque of the control law and returns the new state of
+the arm.
 
 Invariant:
-    - The state that a plant returns is treated as a measurement, like the state of a real
-      robot. The log stores it as the joint positions q, the joint velocities qd and the
-      external torques tau_x. Therefore the control can be executed again from a log without the
-      plant, and the checks of a log do not judge the motion of the plant.
+    - The state returned by a plant is treated as a measurement, like the state of a real robot.
+      The log stores it as joint positions q, joint velocities qd and external torques tau_x.
+      The controller can therefore be rerun from a log without the plant, and the checks of a
+      log do not judge the motion of the plant.
 """
 
 import math
@@ -29,7 +29,7 @@ _POSE_NUMBERS = 7
 
 
 class PlantContext(NamedTuple):
-    """Facts about the experiment that a user's arm model (plant) receives when it is created.
+    """Information about the experiment that a plant receives when it is created.
 
     >>> class Scene:
     ...     def __init__(self, facts: tn.PlantContext) -> None:
@@ -40,13 +40,13 @@ class PlantContext(NamedTuple):
 
     Attributes:
         site: Name of the site whose arm the plant moves.
-        scenario: The experiment, with its arms, start poses and tick rates.
+        scenario: The scenario, with its arms, start poses and tick rates.
         q0_rad: Start pose of the arm, in rad, shape (n,).
         h_s: Duration of a tick, in s.
-        seed: Seed for random numbers of the plant. It depends on the scenario's seed and the
-            site.
-        bodies_m: Extents of the bodies that the plant moves in addition to the arm, by name,
-            along their own axes x, y and z, in m.
+        seed: Seed for random numbers of the plant, derived from the seed of the scenario and
+            the name of the site.
+        bodies_m: Mapping from name to size of the bodies that the plant moves in addition to
+            the arm, along their own axes x, y and z, in m.
     """
 
     site: str
@@ -58,55 +58,53 @@ class PlantContext(NamedTuple):
 
 
 class _PlantProgram(Protocol):
-    """Interface of a user's plant: a program that computes the motion of an arm.
+    """Interface of a user's plant, which computes the motion of an arm.
 
-    The user's class is called with a `PlantContext` as its first argument, and with its
-    settings by name.
+    The user's class is called with a `PlantContext` as its first argument, followed by its
+    settings as keyword arguments.
     """
 
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
-        """Computes the motion of the arm over a control period with a constant motor torque.
+        """Simulates one control period with constant motor torque.
 
         Args:
             tau: Control torque ON the joints, in N m, shape (n,).
             h_s: Duration of the period, in s.
 
         Returns:
-            q in rad and qd in rad/s at the end of the period. A plant that knows the torque of
-            contacts also returns tau_x in N m, with the sign of Eq. (8): the negative of the
-            torque ON the arm.
+            q in rad and qd in rad/s at the end of the period. A plant that knows the contact
+            torques also returns tau_x in N m, with the sign of Eq. (8): minus the torque ON the
+            arm.
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns the current poses of the bodies that the model moves in addition to the arm.
+        """Returns the current poses of the bodies that the plant moves in addition to the arm.
 
-        The bodies have the order of `PlantContext.bodies_m`. The method is called only if there
-        are bodies.
+        Bodies are listed in the order of `PlantContext.bodies_m`. Called only if there are any.
 
         Returns:
-            Seven numbers per body: x, y and z of its centre in the frame of the arm's base, in
-            m, and the quaternion w, x, y, z.
+            Seven numbers per body: x, y and z of its centre in the base frame of the arm, in m,
+                and the quaternion w, x, y, z.
         """
 
 
 class PlantPlayer:
-    """Runs a user's arm model (plant) for one site, one control period after another.
-
-    A plant is a class that computes the motion of an arm from the torques of its motors.
+    """Runs the plant of one site, one control period at a time.
 
     Args:
         scenario: The scenario.
         site: Name of the site.
         plant: Table of the plant.
-        watch: Function that calls the code of the plant, for example with a time limit.
+        watch: Function through which the code of the plant is called, for example with a time
+            limit.
 
     Attributes:
-        state: State of the arm and the bodies in the next tick.
+        state: State of the arm and the bodies at the next tick.
         rate_hz: Tick rate of the site, in Hz.
 
     Raises:
         ScenarioError: The class cannot be used, or lacks a method.
-        PlantFailed: The first poses of the bodies are not valid.
+        PlantFailed: The initial poses of the bodies are not valid.
     """
 
     def __init__(
@@ -140,10 +138,29 @@ class PlantPlayer:
         bodies = self._call(0, self._read_poses)
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
-    def move(self, tick: int, tau: Sequence[float]) -> None:
-        """Computes the motion from one control period to the next by the user's arm model.
+    @classmethod
+    def make_all(cls, scenario: Scenario) -> "dict[str, PlantPlayer]":
+        """Creates the plants of all sites that have one.
 
-        The result is stored in `state`.
+        Args:
+            scenario: The scenario.
+
+        Returns:
+            Mapping from site name to the object that runs the plant. Empty if no site has a
+            plant.
+
+        Raises:
+            CodeWithheld: A class may not run.
+            ScenarioError: A plant cannot be created.
+        """
+        return {
+            name: cls(scenario, name, spec.plant)
+            for name, spec in scenario.sites.items()
+            if isinstance(spec.plant, OwnPlant)
+        }
+
+    def move(self, tick: int, tau: Sequence[float]) -> None:
+        """Runs the plant for one control period and stores the result in `state`.
 
         Args:
             tick: Number of the tick that has been executed.
@@ -151,7 +168,7 @@ class PlantPlayer:
 
         Raises:
             PlantFailed: The plant raised an error, or returned a state with wrong lengths or
-                numbers that are not finite.
+                non-finite values.
         """
         vectors = self._call(tick, lambda: self._step(tau))
         for name, vector in zip(("q", "qd", "tau_x"), vectors, strict=False):
@@ -170,9 +187,9 @@ class PlantPlayer:
         self.state = PlantState(q, qd, tau_x, bodies)
 
     def _step(self, tau: Sequence[float]) -> list[list[float]]:
-        """Calls the user's arm model for one control period, and returns the motion after it.
+        """Calls the plant for one control period and returns the motion after it.
 
-        The result is q, qd and, if the model measures it, the external torque tau_x.
+        Returns q, qd and, if the plant measures it, the external torque tau_x.
         """
         q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
         vectors = [q, qd, *others[:1]]
@@ -182,8 +199,7 @@ class PlantPlayer:
         """Returns the poses of all bodies as one list, with seven numbers per body.
 
         Raises:
-            ValueError: The plant returned another number of poses, or numbers that are not
-                finite.
+            ValueError: The plant returned the wrong number of poses, or non-finite numbers.
         """
         if not self._body_count:
             return []
@@ -199,10 +215,10 @@ class PlantPlayer:
         return numbers
 
     def _call(self, tick: int, function: Callable[[], T]) -> T:
-        """Calls a function of the user's arm model, and reports an exception with its place.
+        """Calls a function of the plant, and reports where any exception was raised.
 
         Args:
-            tick: Tick, for the error message.
+            tick: Number of the tick, for the error message.
             function: The call.
 
         Raises:
@@ -216,27 +232,5 @@ class PlantPlayer:
             raise self._make_error(tick, describe_exception(error)) from error
 
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
-        """Returns the error that the user's arm model failed in a certain control period."""
+        """Returns the error for a plant that failed in the given control period."""
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
-
-
-def make_plant_players(scenario: Scenario) -> dict[str, PlantPlayer]:
-    """Creates the users' plants of all sites that have one.
-
-    A plant is a user's class that computes the motion of an arm in place of this program.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        An object that runs the plant, by the name of the site. Empty if no site has a plant.
-
-    Raises:
-        CodeWithheld: A class may not run.
-        ScenarioError: A plant cannot be created.
-    """
-    return {
-        name: PlantPlayer(scenario, name, spec.plant)
-        for name, spec in scenario.sites.items()
-        if isinstance(spec.plant, OwnPlant)
-    }

@@ -1,17 +1,16 @@
 """Explains errors in the tables of a scenario to its author.
 
-A scenario is a TOML file that describes an experiment. The library msgspec compares its tables
-with types, and refuses the first value that does not fit. Its message is written for
-programmers: "Expected `float | object`, got `str` - at `$.sites[...].arm.l1_m`". This module
-converts the message to an error that names the key as it is written in the file, and states the
-permitted values.
+The tables are validated by the library msgspec, which rejects the first value of the wrong
+type. Its message is meant for programmers: "Expected `float | object`, got `str` - at
+`$.sites[...].arm.l1_m`". This module converts such a message to an error that names the key as
+written in the file, and states the permitted values.
 
-The annotation of a type may describe the permitted values in words: `Meta(extra={"must_be": "a
-time in s"})`.
+A type annotation may describe the permitted values in words: `Meta(extra={"must_be": "a time in
+s"})`.
 
 Invariant:
-    - `refuse` composes every error message about a table that msgspec has refused. The tables
-      of operators and environments are an exception, because their keys have their own texts
+    - `refuse` composes the error message for every table that msgspec rejects, except for
+      tables of operators and environments, whose keys have messages of their own
       (`operators.VALUE_TEXTS`).
 """
 
@@ -39,11 +38,11 @@ from .key_checks import (
 )
 
 _MESSAGE = re.compile(r"(?P<problem>.*) - at `\$(?P<location>.*)`", re.DOTALL)
-"""Matches a message of msgspec about a value inside a table."""
+"""Matches a msgspec error message about a value inside a table."""
 _LOCATION_PART = re.compile(r"\.(?P<key>[^.\[]+)|\[(?P<index>\d+)\]|\[\.\.\.\]")
-"""Matches the next part of a location in a message of msgspec: `.arm`, `[0]` or `[...]`.
+"""Matches the next part of a location in a msgspec message: `.arm`, `[0]` or `[...]`.
 
-`[...]` stands for a key of a dictionary, for example for the name of a site.
+`[...]` stands for a dictionary key, for example the name of a site.
 """
 _VECTOR_ENTRY = {
     "joints": "joint",
@@ -51,14 +50,14 @@ _VECTOR_ENTRY = {
     "axes": "axis",
     "shared": "coordinate that the sites share",
 }
-"""Noun for one entry of a vector, by the name of the vector's length in `VectorCounts`."""
+"""Mapping from each length in `VectorCounts` to the noun for one entry of such a vector."""
 
 MAX_QUOTED_LENGTH = 60
-"""Length up to which an error message quotes a value."""
+"""Maximum length of a value quoted in an error message."""
 
 T = TypeVar("T")
 Location = list[str | int]
-"""Keys and indices that lead from a table to a value inside the table."""
+"""Keys and indices that lead from a table to a value inside it."""
 
 
 def refuse(
@@ -68,21 +67,21 @@ def refuse(
     path: str,
     elsewhere: Sequence[str] = (),
 ) -> ScenarioError:
-    """Converts an error of the library msgspec to an error for the author of the refused table.
+    """Converts a msgspec validation error to an error meant for the author of the table.
 
-    The new error names the wrong key by its path in the scenario, and states the permitted
+    The new error names the wrong key by its path in the scenario and states the permitted
     values.
 
     Args:
-        error: Error that msgspec raised when it compared the table with its type.
-        table: The refused table.
+        error: Error raised by msgspec for the table.
+        table: The rejected table.
         kind: Type of the table.
-        path: Dotted path of the table in the scenario. Empty for the whole scenario.
-        elsewhere: Dotted paths of keys in other tables, which the author may have meant by an
+        path: Dotted path of the table in the scenario. Empty for the scenario itself.
+        elsewhere: Dotted paths of keys in other tables that the author may have meant by an
             unknown key.
 
     Returns:
-        The error with the path of the wrong key. The caller raises it.
+        The new error, to be raised by the caller.
     """
     message, location = _split_message(str(error), table, kind)
     number_location = _find_table_for_number(table, kind, location)
@@ -105,19 +104,17 @@ def refuse(
 
 
 def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] = ()) -> T:
-    """Converts one table of a scenario to its type, and refuses unknown keys and wrong values.
+    """Converts one table of a scenario to an instance of `kind`.
 
     Args:
-        table: The table as its author wrote it.
+        table: The table as written by its author.
         kind: Type of the table.
         path: Dotted path of the table.
-        elsewhere: Dotted paths of keys in other tables, which the author may have meant.
-
-    Returns:
-        The table as a typed value.
+        elsewhere: Dotted paths of keys in other tables that the author may have meant.
 
     Raises:
-        ScenarioError: The table is refused. The error contains the path of the key.
+        ScenarioError: The table contains an unknown key or an invalid value. The error contains
+            the path of the key.
     """
     try:
         return msgspec.convert(table, kind)
@@ -128,20 +125,20 @@ def check_table(table: Any, kind: type[T], path: str, elsewhere: Sequence[str] =
 def convert_drawn(
     table: TomlTable, kind: type[T], path: str, drawn: Mapping[str, Distribution], seed: int
 ) -> T:
-    """Converts a complete table of a scenario, with its random numbers drawn, to its type.
+    """Converts a complete table of a scenario, after random numbers were drawn, to its type.
 
-    A drawn number that is not valid is reported with its distribution and seed.
+    An invalid drawn number is reported together with its distribution and seed.
 
     Args:
         table: The table.
         kind: Type of the complete table.
-        path: Dotted path of the table. Empty for the whole scenario.
-        drawn: Distributions of the drawn numbers, by the dotted key of the number.
+        path: Dotted path of the table. Empty for the scenario itself.
+        drawn: Mapping from dotted key to the distribution of each drawn number.
         seed: Seed with which the numbers were drawn.
 
     Raises:
-        ScenarioError: A value has a wrong type or range. If the value was drawn at random, the
-            error mentions this, because the author did not write the number.
+        ScenarioError: A value has a wrong type or is out of range. If the value was drawn at
+            random, the error says so, since the author did not write it.
     """
     try:
         return msgspec.convert(table, kind)
@@ -155,10 +152,10 @@ def convert_drawn(
 
 
 def _join_path(path: str, location: Location) -> str:
-    """Returns the dotted path of a value inside a table, as in `sites.m1.q0_rad[0]`.
+    """Returns the dotted path of a value inside a table, such as `sites.m1.q0_rad[0]`.
 
     Args:
-        path: Dotted path of the table. Empty for the whole scenario.
+        path: Dotted path of the table. Empty for the scenario itself.
         location: Keys and indices that lead from the table to the value.
     """
     for part in location:
@@ -173,7 +170,7 @@ def _describe_wrong_type(value: Any, expected: str) -> str:
     """Explains why a value from a scenario file has the wrong type.
 
     Args:
-        value: The value as it was read from TOML.
+        value: The value as read from TOML.
         expected: Description of the permitted values, such as "a number".
 
     Returns:
@@ -194,11 +191,11 @@ def _describe_wrong_type(value: Any, expected: str) -> str:
 def _describe_wrong_value(
     message: str, table: Any, kind: Any, location: Location, path: str
 ) -> str:
-    """Explains why a value has a wrong type or is out of range.
+    """Explains why a value has the wrong type or is out of range.
 
     Args:
-        message: Message of msgspec without the location.
-        table: The refused table.
+        message: Message of msgspec, excluding the location.
+        table: The rejected table.
         kind: Type of the table.
         location: Location of the value in the table.
         path: Dotted path of the table.
@@ -234,11 +231,11 @@ def _describe_table_for_number(table: TomlTable, kind: Any, location: Location) 
 
 
 def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
-    """Explains why a value is not a permitted number, and states the permitted values.
+    """Explains why a value is not a valid number, and states the permitted values.
 
     Args:
         value: The value.
-        kind: Type of the refused table.
+        kind: Type of the rejected table.
         location: Location of the value in the table.
     """
     vector_length = _find_extra(kind, location, "per")
@@ -249,7 +246,7 @@ def _describe_wrong_number(value: Any, kind: Any, location: Location) -> str:
 
 
 def _quoted_key(problem: str, start: str) -> str | None:
-    """Returns the key that a message quotes after the words `start`, or None if there is none.
+    """Returns the key quoted in a message after the words `start`, or None.
 
     For example, "Object missing required field `name`" quotes the key "name".
     """
@@ -261,14 +258,14 @@ def _quoted_key(problem: str, start: str) -> str | None:
 
 
 def _split_message(message: str, table: Any, kind: Any) -> tuple[str, Location]:
-    """Splits a message of msgspec into the problem and the location of the refused value.
+    """Splits a msgspec message into the problem and the location of the rejected value.
 
-    msgspec does not name the keys of a dictionary: it writes `$.sites[...].q0_rad[0]`. These
-    keys are found by `_find_refused_key`.
+    msgspec does not name dictionary keys: it writes `$.sites[...].q0_rad[0]`.
+    `_find_refused_key` determines these keys.
 
     Args:
         message: The message.
-        table: The refused table.
+        table: The rejected table.
         kind: Type of the table.
     """
     match = _MESSAGE.fullmatch(message)
@@ -292,19 +289,19 @@ def _split_message(message: str, table: Any, kind: Any) -> tuple[str, Location]:
 
 
 def _find_refused_key(message: str, table: Any, kind: Any, location: Location) -> str | None:
-    """Finds which entry of a dictionary the library msgspec has refused.
+    """Determines which entry of a dictionary was rejected by msgspec.
 
-    Its messages do not name the keys of dictionaries. Therefore entries are converted one by
-    one, until one gives the same message.
+    Its messages do not name dictionary keys, so entries are converted one at a time until one
+    produces the same message.
 
     Args:
         message: The message.
-        table: The refused table.
+        table: The rejected table.
         kind: Type of the table.
         location: Location of the dictionary in the table.
 
     Returns:
-        The key. None if no entry alone is refused with this message.
+        The key, or None if no single entry produces this message.
     """
     for key, entry in _value_at(table, location).items():
         try:
@@ -316,11 +313,11 @@ def _find_refused_key(message: str, table: Any, kind: Any, location: Location) -
 
 
 def _isolate(table: Any, location: Location, value: Any) -> Any:
-    """Returns a copy of a table with one value replaced, and without other tables.
+    """Returns a copy of a table with one value replaced and other tables removed.
 
-    Values in the same table that are not tables are kept, because one of them may determine the
-    type, as the key `law` does. The other tables are left out, because comparing them again for
-    every entry of a long scenario would take too much time.
+    Values in the same table that are not tables are kept, since one of them may determine the
+    type, like the key `law`. The other tables are removed because validating them again for
+    every entry of a long scenario would take too long.
     """
     if not location:
         return value
@@ -341,9 +338,9 @@ def _value_at(table: Any, location: Location) -> Any:
 
 
 def _find_table_for_number(table: Any, kind: Any, location: Location) -> Location | None:
-    """Finds a table around a refused value that was written in place of a number.
+    """Finds a table around a rejected value that was written in place of a number.
 
-    Such a table states, or was meant to state, a random distribution. The result is None if
+    Such a table specifies, or was meant to specify, a random distribution. Returns None if
     there is no such table.
     """
     for length in range(1, len(location) + 1):
@@ -355,7 +352,7 @@ def _find_table_for_number(table: Any, kind: Any, location: Location) -> Locatio
 
 
 def _list_hints(kind: Any, location: Location) -> list[Any]:
-    """Returns the types that a value may have at a location in a scenario's table.
+    """Returns the types that a value may have at a location in a scenario table.
 
     Args:
         kind: Type of the table.
@@ -379,7 +376,7 @@ def _list_alternatives(hint: Any) -> Iterator[Any]:
 
 
 def _list_inner_hints(hint: Any, part: str | int) -> Iterator[Any]:
-    """Yields the types one level deeper: of a field, a dictionary's value or a list's entry.
+    """Yields the types one level down: of a field, dictionary value or list entry.
 
     Args:
         hint: Type of the struct, dictionary or list.
@@ -397,24 +394,24 @@ def _list_inner_hints(hint: Any, part: str | int) -> Iterator[Any]:
 
 
 def _strip_annotation(hint: Any) -> Any:
-    """Returns a type without the limits that an annotation adds to it."""
+    """Removes the limits that an annotation adds to a type."""
     return get_args(hint)[0] if get_origin(hint) is Annotated else hint
 
 
 def _find_extra(kind: Any, location: Location, name: str) -> str | None:
-    """Returns the entry of a value's annotation in `Meta.extra` under a name, or None."""
+    """Looks up a name in the `Meta.extra` of a value's annotation, or returns None."""
     extras = (find_extra(hint, name) for hint in _list_hints(kind, location))
     return next((extra for extra in extras if extra is not None), None)
 
 
 def _list_keys(hint: Any) -> tuple[str, ...]:
-    """Returns the keys that a table of a type may have. Empty if the type is not a table."""
+    """Returns the keys that a table of the given type may have. Empty for other types."""
     is_struct = isinstance(hint, type) and issubclass(hint, msgspec.Struct)
     return field_names(hint) if is_struct else ()
 
 
 def _list_choices(hint: Any) -> tuple[str, ...]:
-    """Returns the texts that a type permits. Empty if the type is not a choice of texts."""
+    """Returns the strings permitted by a type. Empty if the type is not a choice of strings."""
     return get_args(hint) if get_origin(hint) is Literal else ()
 
 

@@ -1,22 +1,22 @@
-"""Completes the tables of a scenario file: defaults, presets, inherited keys, named files.
+"""Resolves the tables of a scenario file: defaults, presets, inherited keys, named files.
 
-A scenario is a TOML file that describes an experiment. Its author may leave out most keys. The
-function `resolve_scenario` returns tables in which nothing is left out:
+The author of a scenario may leave out most keys. `resolve_scenario` returns tables in which
+every key is present:
 
-1. It refuses unknown keys and values of a wrong type, see `written_tables`.
-2. It writes out every default, and copies the keys of the tables for all sites (such as
-   `[arm]`) into the table of each site.
-3. It replaces each number that is given as a probability distribution by a number that is drawn
-   from the distribution with the seed of the scenario.
-4. It reads the files that the scenario names (URDF files of arms, traces of delays), so that
-   the result needs no other file.
+1. Unknown keys and values of a wrong type are rejected (see `written_tables`).
+2. Defaults are written out, and the keys of tables for all sites (such as `[arm]`) are copied
+   into the table of each site.
+3. Each probability distribution is replaced with a number drawn from it, using the seed of the
+   scenario.
+4. Named files (URDF files of arms, delay traces) are read, so the result depends on no other
+   file.
 
-Afterwards, `validate.build_scenario` converts the result to the type `Scenario`, and checks
-conditions that involve several tables.
+`validate.build_scenario` then converts the result to the type `Scenario` and checks conditions
+that involve several tables.
 
 Invariant:
-    - A key is checked in the table in which its author wrote it. Therefore the author can find
-      the path of an error message in the file.
+    - A key is checked in the table in which its author wrote it, so the path in an error
+      message can be found in the file.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ import numpy as np
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import TomlTable
 from .distributions import Draws
-from .expect import complete_expect
+from .expect import Expect
 from .key_checks import check_keys, is_number
 from .link_tables import change_link, complete_link_tables
 from .named_files import NamedFiles, use_unix_line_ends
@@ -39,14 +39,14 @@ from .written_tables import WrittenChange, WrittenScenario
 
 
 def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
-    """Returns the tables of a scenario file with every default and every named file filled in.
+    """Fills in all defaults and named files of a scenario.
 
-    The result describes the experiment completely, without any other file.
+    The result describes the experiment completely and depends on no other file.
 
     Args:
-        tables: Tables of the scenario file, as its author wrote them.
-        folder: Folder of the files that the tables name. If None, tables that name a file are
-            refused.
+        tables: Tables of the scenario file, as written by its author.
+        folder: Folder in which files named in the scenario are looked up. If None, a scenario
+            that names a file is rejected.
 
     Returns:
         Tables with the keys of `Scenario`.
@@ -61,7 +61,7 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     # the order of their keys is the order of the random draws.
     sites = complete_site_tables(tables, written.rate_hz, draws, files)
     site_names = list(sites)
-    expect = complete_expect(tables.get("expect", {}), sites, files.urdf_texts)
+    expect = Expect.complete_table(tables.get("expect", {}), sites, files.urdf_texts)
     check_keys(written.dominance, site_names, "dominance")
     dominance_rows = {
         name: resolve_dominance_row(
@@ -89,20 +89,17 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
 
 
 def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:
-    """Returns the weights with which one arm follows each of the others, in a scenario.
-
-    The weights are called dominance factors. An arm that the author did not name has the weight
-    0.
+    """Completes the dominance factors of one site.
 
     Args:
-        written: Row as its author wrote it. A peer that is not named in the row has the factor
-            0. None if there is no row.
+        written: Row as written by its author, or None if there is none. A peer that is not
+            named has the factor 0.
         names: Names of all sites of the scenario.
-        site: Name of the site that follows.
+        site: Name of the site to which the row belongs.
         path: Path of the row, for error messages.
 
     Returns:
-        The factor of every peer, by name.
+        Mapping from peer name to dominance factor.
 
     Raises:
         ScenarioError: A factor is not a number, or the row as a whole is not valid.
@@ -126,20 +123,18 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 def _complete_timeline(
     written: Sequence[WrittenChange], links: TomlTable, site_names: list[str]
 ) -> list[TomlTable]:
-    """Returns the planned changes of an experiment, each complete in itself.
+    """Returns the planned changes of a scenario, each complete in itself.
 
-    A change affects a network link, or the weights with which an arm follows the others. An
-    author may state only those settings of a link that change. In the result, each change
-    states all settings. The other settings keep their values from earlier changes.
+    An author may state only those link settings that change. In the result, each change
+    contains all settings, with unchanged settings carried over from earlier changes.
 
     Args:
-        written: Changes as their author wrote them.
-        links: Complete links at the start of the run, by name.
+        written: Changes as written by their author.
+        links: Mapping from name to complete link at the start of the run.
         site_names: Names of all sites of the scenario.
 
     Raises:
-        ScenarioError: A change is not valid, or the changes are not in the order of their
-            times.
+        ScenarioError: A change is not valid, or the changes are not in ascending order of time.
     """
     current_links = dict(links)
     changes = []
@@ -167,19 +162,16 @@ def _complete_timeline(
 def complete_target(
     change: WrittenChange, current_links: TomlTable, site_names: list[str], path: str
 ) -> TomlTable:
-    """Completes the new settings that a change during a run states.
-
-    A change concerns a link, which is the one-way connection between two sites (the processes
-    of the arms), or the weights with which one site follows the others.
+    """Completes the new settings in a planned or requested change.
 
     Args:
-        change: The change of a link or of the weights of a site.
-        current_links: Settings of all links before the change, by name.
+        change: Change of a link, or of the dominance factors of a site.
+        current_links: Mapping from link name to the settings before the change.
         site_names: Names of all sites of the scenario.
         path: Path of the change, for error messages.
 
     Returns:
-        All settings of the link after the change, or the weights for all other sites.
+        All settings of the link after the change, or the dominance factors for all peers.
 
     Raises:
         ScenarioError: There is no such link or site, or a value is not valid.

@@ -1,16 +1,16 @@
-"""Computes in advance how long an arm takes to stop, and how fast its joints may become.
+"""Computes bounds on how long an arm takes to stop and how fast its joints can move.
 
-An arm must stop if, for example, the network fails. Its controller then damps each joint in
-proportion to its speed, within the limits of the torques (`core.resting`). From the model of
-the arm and these limits, this module computes bounds of the time and of the speeds. It also
-determines whether the motors are strong enough for the arm's gravity and Coriolis torques.
+When an arm must stop, for example because the network failed, its controller damps each joint
+in proportion to its speed, within the torque limits (`core.resting`). This module derives
+bounds on the stopping time and on the speeds from the model of the arm and these limits. It
+also determines whether the motors are strong enough for the arm's gravity and Coriolis torques.
 
-The formulas are derived in docs/theory/coming-to-rest.md, and the numbers of equations in
-comments refer to it.
+The formulas are derived in docs/theory/coming-to-rest.md; equation numbers in comments refer to
+that page.
 
 Invariant:
-    - The bounds of a scenario, the description of an experiment, are always the same. The poses
-      at which the model is evaluated are random, but the seed of the generator is fixed.
+    - The bounds are deterministic for a given scenario. The model is evaluated at random poses,
+      but the seed of the generator is fixed.
 """
 
 import math
@@ -30,33 +30,31 @@ from .arms import Arm, ArmModel
 from .scenario_types import Scenario
 
 AT_REST_RAD_S = 0.05
-"""Speed of the joints below which an arm counts as at rest, in rad/s."""
+"""Joint speed below which an arm is considered at rest, in rad/s."""
 SETTLE_TIMES = 10.0
 """Number of time constants `RestGains.time_s` after which the initial torque has decayed."""
 _POSES = 100
-"""Number of poses in which the dynamics of an arm are computed."""
+"""Number of poses at which the dynamics of an arm are evaluated."""
 _LEAST_NM = 1e-300
-"""Smallest divisor, which avoids a division by zero."""
+"""Smallest divisor, to avoid division by zero."""
 _MAX_PATTERNS = 64
-"""Largest number of combinations of the joints' directions that are examined."""
+"""Maximum number of combinations of joint directions to examine."""
 
 
 class _RestBounds(NamedTuple):
-    """Bounds of the motion with which an arm comes to rest after a stop.
+    """Bounds on the motion of an arm that comes to rest after a stop.
 
-    The bounds hold for a certain speed of the joints at the beginning of the stop.
+    The bounds hold for a given joint speed at the beginning of the stop.
 
     Attributes:
-        rest_s: Time within which the arm is at rest, in s. Infinite if its motors cannot hold
-            the arm against gravity.
-        bearable_share: Ratio of two speeds of the joints: the largest speed at which the motors
-            can balance both gravity and the Coriolis torques, divided by the speed at the
-            beginning.
-        kinetic_j: Largest kinetic energy of the arm at the beginning, in J.
+        rest_s: Time within which the arm comes to rest, in s; infinite if its motors cannot
+            hold it against gravity.
+        bearable_share: Largest joint speed at which the motors can balance both gravity and
+            Coriolis torques, divided by the initial speed.
+        kinetic_j: Largest initial kinetic energy of the arm, in J.
         blend_j: Largest energy that the motors add to the arm, in J, because their torques fade
-            out gradually instead of stopping at once.
-        peak_rad_s: Largest speed of each joint that these energies permit, in rad/s, shape
-            (n,).
+            out gradually instead of stopping immediately.
+        peak_rad_s: Largest joint speeds that these energies permit, in rad/s, shape (n,).
     """
 
     rest_s: float
@@ -67,15 +65,15 @@ class _RestBounds(NamedTuple):
 
 
 class _ArmSamples(NamedTuple):
-    """Inertias, Coriolis torques and gravity torques of an arm in many poses.
+    """Inertias, Coriolis torques and gravity torques of an arm at many poses.
 
-    The bounds of a stop are the worst values over these poses.
+    The bounds for a stop are the worst values over these poses.
 
     Attributes:
-        M: Inertia matrix in each pose, shape (poses, n, n).
-        G: Absolute gravity torque in each pose, in N m, shape (poses, n).
-        coriolis: Largest absolute Coriolis torque over all directions in which the joints may
-            move, in N m, shape (poses, n).
+        M: Inertia matrix at each pose, shape (poses, n, n).
+        G: Absolute gravity torque at each pose, in N m, shape (poses, n).
+        coriolis: Largest absolute Coriolis torque over all directions of joint motion, in N m,
+            shape (poses, n).
     """
 
     M: Array
@@ -84,16 +82,15 @@ class _ArmSamples(NamedTuple):
 
 
 def find_rest_bounds(scenario: Scenario, site: str) -> _RestBounds:
-    """Computes bounds of the time, energy and speeds with which an arm comes to rest.
+    """Bounds the time, energy and joint speeds of an arm that comes to rest.
 
-    Before a real arm moves, its user needs to know how long and how fast the arm may still move
-    after a stop.
+    The user of a real arm needs to know how long and how fast the arm can move after a stop.
 
     Args:
-        scenario: Description of the experiment. The site must have the stale rule "glide",
-            under which damping brings the arm to rest when the site stops.
-        site: Name of the site whose arm stops. At the beginning, its joints are as fast as its
-            limits allow.
+        scenario: The scenario. The stale rule of the site must be "glide", under which an arm
+            is brought to rest by damping when its site stops.
+        site: Name of the site whose arm stops. Initially, its joints move as fast as its limits
+            allow.
     """
     spec = scenario.sites[site]
     setup = scenario.setup(site)
@@ -141,17 +138,17 @@ def find_rest_bounds(scenario: Scenario, site: str) -> _RestBounds:
 def _bound_rest_time(
     setup: SiteSetup, speed: Array, limit_nm: Array, samples: _ArmSamples, energy_j: float
 ) -> float:
-    """Computes the time within which an arm is at rest after a stop, Eq. (8), in s.
+    """Computes the time within which an arm comes to rest after a stop, Eq. (8), in s.
 
     Args:
         setup: Setup of the site.
-        speed: Speed of each joint at the beginning, in rad/s, shape (n,).
+        speed: Initial speed of each joint, in rad/s, shape (n,).
         limit_nm: Largest torque of each joint, in N m, shape (n,).
         samples: Dynamics of the arm.
-        energy_j: Largest energy at the beginning, in J.
+        energy_j: Largest initial energy, in J.
 
     Returns:
-        The time. Infinite if the motors cannot hold the arm against gravity.
+        The time; infinite if the motors cannot hold the arm against gravity.
     """
     gravity_nm = samples.G.max(axis=0)
     available_nm = limit_nm - gravity_nm
@@ -179,10 +176,10 @@ def _bound_rest_time(
 
 
 def _list_patterns(joints: int) -> Array:
-    """Returns the combinations of directions in which the joints of an arm may move: 1 or -1.
+    """Returns the combinations of joint directions, 1 or -1, in which an arm may move.
 
-    The first joint always has the direction 1, because the opposite combination has the same
-    kinetic energy and the same Coriolis torques.
+    The first joint always has direction 1, since the opposite combination has the same kinetic
+    energy and the same Coriolis torques.
 
     Returns:
         Array of shape (patterns, joints), with at most `_MAX_PATTERNS` rows.
@@ -193,9 +190,9 @@ def _list_patterns(joints: int) -> Array:
 
 
 def _draw_poses(model: ArmModel, q0: Array) -> Array:
-    """Returns the start pose, and random poses between the joints' stops, shape (poses, n).
+    """Returns the start pose and random poses between the joint stops, shape (poses, n).
 
-    A joint without a stop is drawn between -pi and pi.
+    A joint with no stop is drawn between -pi and pi.
     """
     assert model.chain is not None
     low = []
@@ -209,10 +206,10 @@ def _draw_poses(model: ArmModel, q0: Array) -> Array:
 
 
 def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
-    """Computes the dynamics of the planar arm for all angles of its elbow.
+    """Computes the dynamics of the planar arm for all elbow angles.
 
-    The equations are (2) to (5) and (24) of the paper. Inertia and Coriolis torques do not
-    depend on the angle of the shoulder. The gravity torques are upper bounds over all poses.
+    Uses Eqs. (2) to (5) and (24) of the paper. Inertia and Coriolis torques do not depend on
+    the shoulder angle. The gravity torques are upper bounds over all poses.
 
     Args:
         arm: Table of the arm.
@@ -237,10 +234,9 @@ def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
 
 
 def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
-    """Computes the dynamics of a chain in its start pose and in random poses.
+    """Computes the dynamics of a chain at its start pose and at random poses.
 
-    The bounds of a stop are derived from these poses. Friction is left out, because it only
-    dissipates energy.
+    Friction is ignored, since it only dissipates energy.
 
     Args:
         model: Model of the arm.

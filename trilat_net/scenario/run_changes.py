@@ -1,15 +1,13 @@
-"""Checks changes of a running experiment, such as a new delay or a stop.
+"""Validates changes to a running experiment, such as a new delay or a stop.
 
-Three things can change: a network link between two arms, the weights with which an arm follows
-the others (dominance factors), and the mode of an arm, by commands such as stop, enable and
-reset. Changes are planned in a scenario, the description of the experiment, or requested during
-the run.
+A change affects a network link, the dominance factors of a site, or the mode of an arm (through
+commands such as stop, enable and reset). Changes are either planned in the scenario or
+requested during the run.
 
 Invariant:
-    - A request may state only the settings that change. They are completed with the settings
-      before the change, and the log contains the complete change as a string. Therefore all
-      programs that read the log derive the same `CoreChange`, the record that the control loop
-      uses.
+    - A request only needs to contain the settings that change. It is completed with the current
+      settings, and the log stores the complete change as a string. All programs that read the
+      log therefore derive the same `CoreChange`, the record used by the control loop.
 """
 
 from collections import deque
@@ -31,14 +29,14 @@ from .written_tables import WrittenChange
 
 
 class LinkTables(dict[str, dict[str, Any]]):
-    """Present settings of every network link during a run, by the name of the link.
+    """Current settings of every network link during a run.
 
-    The settings, such as the delay, change at planned times, which `advance_to` applies. A
-    caller that accepts a change requested by a user stores the new settings itself.
+    `advance_to` applies planned changes. A caller that accepts a change requested by a user
+    stores the new settings itself.
 
     Args:
-        links: Links at the start of the run, by name.
-        timeline: Planned changes, in the order of their times.
+        links: Mapping from link name to the settings at the start of the run.
+        timeline: Planned changes in ascending order of time.
     """
 
     def __init__(self, links: Mapping[str, LinkBase], timeline: Sequence[Change]) -> None:
@@ -46,7 +44,7 @@ class LinkTables(dict[str, dict[str, Any]]):
         self._planned = deque(change for change in timeline if change.link)
 
     def advance_to(self, t_ns: int) -> None:
-        """Applies the changes of network links that the scenario plans up to a time.
+        """Applies all planned link changes up to a given time.
 
         Args:
             t_ns: The time, in ns after the epoch (the common start time).
@@ -59,13 +57,13 @@ class LinkTables(dict[str, dict[str, Any]]):
 def resolve_change(
     scenario: Scenario, current_links: LinkTables, written: dict[str, Any], from_ns: int
 ) -> Change:
-    """Completes and checks a change that a user requests during a run.
+    """Completes and validates a change that a user requests during a run.
 
-    It changes a network link, or the weights with which one arm follows the others. A user may
-    state only the settings of a link that change. All others keep their present values.
+    The request may contain only the link settings that change; all others keep their current
+    values.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
         current_links: Current settings of all links.
         written: The request: `link` or `dominance`, and the new settings as `to`.
         from_ns: Time at which the change takes effect, in ns after the common start time of all
@@ -103,17 +101,17 @@ def resolve_change(
 
 
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
-    """Converts the text of a change in a log to the form that the compiled control loop reads.
+    """Parses a logged change into the record that the compiled control loop reads.
 
-    The log may come from an untrusted source, so the change is checked completely.
+    The log may come from an untrusted source, so the change is validated completely.
 
     Args:
         scenario: Scenario of the run.
         site: Name of the site that published the record.
-        text: JSON text of the change, as the record contains it.
+        text: The change as JSON, as stored in the record.
 
     Raises:
-        ScenarioError: The text is not a valid change, or not a change of this site.
+        ScenarioError: The text is not a valid change, or the change belongs to another site.
     """
     try:
         change = msgspec.json.decode(text, type=Change)

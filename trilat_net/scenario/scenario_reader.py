@@ -1,18 +1,17 @@
-"""Loads scenarios, the descriptions of experiments, from files, texts, tables or logs.
+"""Loads scenarios from files, strings, tables or logs.
 
-A scenario is written as a TOML file, and a log contains the scenario of its run. While loading,
-overrides such as `control.Kd=5` change single keys without editing the file.
+Overrides such as `control.Kd=5` change individual keys while loading, without editing the file.
 
 Invariant:
-    - The scenario of a log or of another member of a session is not trusted. It may not name a
-      file, its code may not run until a person permits it, and its traces (recorded delays of a
-      network) must be written out.
+    - A scenario from a log or from another member of a session is not trusted. It must not name
+      files, its traces (recorded delays of a network) must be written out, and its code does
+      not run until a person permits it.
 """
 
 import pickle
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from threading import RLock
@@ -25,15 +24,7 @@ from ..files import open_regular
 from ..own_code import allow_own_code, name_law_classes
 from ..toml_text import parse_toml
 from .named_files import SHIPPED_FOLDER
-from .override import (
-    Override,
-    apply_overrides,
-    expand_overrides,
-    find_written_path,
-    nest_overrides,
-    parse_overrides,
-    split_entries,
-)
+from .override import ScenarioOverrides, find_written_path
 from .resolve import resolve_scenario
 from .scenario_types import Scenario
 from .validate import build_scenario
@@ -42,10 +33,10 @@ _MAX_NAME_LENGTH = 80
 
 
 def list_shipped() -> list[str]:
-    """Returns the names of the example scenarios that the package contains.
+    """Returns the names of the example scenarios in the package.
 
-    `trilat scenario list` shows the same names. Files whose names begin with an underscore are
-    not listed.
+    These are the names listed by `trilat scenario list`. Files whose names begin with an
+    underscore are excluded.
 
     >>> "paper" in tn.list_shipped()
     True
@@ -59,10 +50,11 @@ def list_shipped() -> list[str]:
 
 
 def read_shipped(name: str) -> str:
-    """Returns the TOML text of an example scenario in the package, such as "paper".
+    """Returns the TOML source of an example scenario in the package, such as "paper".
 
     Args:
-        name: Name of the scenario. The name of an unlisted file begins with an underscore.
+        name: Name of the scenario. Unlisted files, whose names begin with an underscore, are
+            also accepted.
 
     Raises:
         ScenarioError: There is no such scenario.
@@ -82,9 +74,9 @@ def read_shipped(name: str) -> str:
 
 
 def read_template() -> str:
-    """Returns the text that `trilat scenario new` writes: a valid scenario with comments.
+    """Returns the template written by `trilat scenario new`: a valid, commented scenario.
 
-    A user edits the text to describe an experiment.
+    Users edit it to describe their own experiment.
 
     >>> tn.load_scenario(tn.read_template()).names
     ('m1', 'm2', 's')
@@ -99,29 +91,32 @@ def load_scenario(
     duration_s: float | None = None,
     seed: int | None = None,
 ) -> Scenario:
-    """Loads the description of an experiment, and changes single values of it if requested.
+    """Loads a scenario and applies overrides to it.
 
-    The corresponding command is `trilat scenario show`.
+    Equivalent to the command `trilat scenario show`.
 
     >>> tn.load_scenario("paper", {"control.Kd": 5}).names
     ('m1', 'm2', 's')
 
     Args:
-        source: Name of a scenario in the package, path of a file, TOML text of several lines,
-            tables, a `Scenario`, or a run or log, which contains a scenario.
-        overrides: Changed keys, for example `{"control.Kd": 5}` or `["control.Kd=5"]`. If
+        source: Name of a scenario in the package, path of a file, TOML source of several lines,
+            tables, a `Scenario`, or a run or log (which contains a scenario).
+        overrides: Keys to change, for example `{"control.Kd": 5}` or `["control.Kd=5"]`. If
             `source` is a `Scenario`, a key of a group such as `control` applies to all sites or
-            links, see `override`.
-        duration_s: Duration in s. By default, that of the scenario.
-        seed: Seed of the random numbers. By default, that of the scenario.
+            links (see `override`).
+        duration_s: Duration of the run, in s. By default, that of the scenario.
+        seed: Random seed. By default, that of the scenario. With a different seed, numbers
+            specified as distributions are drawn again.
 
     Raises:
         ScenarioError: The source cannot be read or is not a valid scenario.
     """
     source = getattr(source, "scenario", source)
-    pairs = _join_overrides(overrides, duration_s, seed)
     if isinstance(source, Scenario):
+        changed_seed = seed if overrides or seed != source.seed else None
+        pairs = _join_overrides(overrides, duration_s, changed_seed)
         return _change_scenario(source, pairs)
+    pairs = _join_overrides(overrides, duration_s, seed)
     experiment = ExperimentText.read(source)
     is_text = isinstance(source, Mapping) or "\n" in str(source)
     label = "scenario" if is_text else experiment.label
@@ -131,9 +126,9 @@ def load_scenario(
 def _join_overrides(
     overrides: Mapping[str, Any] | Sequence[str], duration_s: float | None, seed: int | None
 ) -> Mapping[str, Any] | Sequence[str]:
-    """Returns overrides together with a duration and a seed, unless these are None.
+    """Adds a duration and a seed to the overrides, unless they are None.
 
-    The result has the type of `overrides`: a mapping, or a list of texts.
+    The result has the type of `overrides`: a mapping, or a list of strings.
     """
     options = {"duration_s": duration_s, "seed": seed}
     chosen_options = {key: value for key, value in options.items() if value is not None}
@@ -146,39 +141,39 @@ def _join_overrides(
 def _change_scenario(
     scenario: Scenario, overrides: Mapping[str, Any] | Sequence[str]
 ) -> Scenario:
-    """Returns the same scenario with some values replaced (overrides).
+    """Returns a copy of a scenario with overrides applied.
 
-    A key such as `control` applies to all arms. A user who names a class in an override thereby
+    A key such as `control` applies to all sites. By naming a class in an override, a user
     permits its code to run.
 
     Raises:
         ScenarioError: An override is not valid.
     """
-    pairs: list[Override] = []
+    parsed = ScenarioOverrides(())
     try:
-        pairs = parse_overrides(overrides)
-        expanded = expand_overrides(scenario, pairs)
+        parsed = ScenarioOverrides.parse(overrides)
+        values = dict(parsed.expand(scenario).pairs)
         changed = scenario
         if overrides:
-            changed = parse_scenario(scenario.text, scenario.name, expanded)
+            changed = parse_scenario(scenario.text, scenario.name, values)
         # A person who names the class of a law, hand or plant in an override permits its code
         # to run.
-        named_classes = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
+        named_classes = re.findall(r"[\w.]+:\w+", repr(list(values.values())))
         return allow_own_code(changed, named_classes, scenario)
     except ScenarioError as error:
-        path = find_written_path(error, nest_overrides(pairs))
+        path = find_written_path(error, parsed.nest())
         raise ScenarioError(error.problem, path=path, source=scenario.name) from None
 
 
 class ExperimentText(NamedTuple):
-    """Description of an experiment as its author wrote it, before it is checked and completed.
+    """Source text of a scenario, before it is validated and completed.
 
     Attributes:
-        label: Name by which a command finds the experiment: the name of a scenario in the
-            package, or a path. An experiment that is not in a file gets the path at which a
+        label: Name under which a command finds the scenario: the name of a scenario in the
+            package, or a path. For a scenario that is not in a file, the path at which a
             command would look for it.
-        text: TOML text.
-        folder: Folder of the files that the text names. None if the text is a resolved
+        text: TOML source.
+        folder: Folder in which files named in the scenario are looked up. None for a resolved
             scenario, which names no files.
     """
 
@@ -187,27 +182,23 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def read_tables(self, overrides: Sequence[str]) -> dict[str, Any]:
-        """Returns the tables of the text, with some values replaced but without any checks.
+        """Parses the source and applies overrides, without validating the result.
 
         Args:
-            overrides: Texts KEY=VALUE, each of which replaces one value of the description.
+            overrides: Strings of the form KEY=VALUE.
 
         Raises:
-            ScenarioError: The text is not TOML, or an override is not valid.
+            ScenarioError: The source is not valid TOML, or an override is not valid.
         """
         tables: dict[str, Any] = pickle.loads(_parse_toml(self.text))
-        apply_overrides(tables, overrides)
+        ScenarioOverrides.parse(overrides).apply_to(tables)
         return tables
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Converts the text to a complete scenario, after some of its values were replaced.
+        """Applies overrides to the source and converts it to a complete scenario.
 
         Args:
-            overrides: Texts KEY=VALUE, each of which replaces one value of the description. By
-                default, there are none.
-
-        Returns:
-            The scenario, in which every setting has a value.
+            overrides: Strings of the form KEY=VALUE. Empty by default.
 
         Raises:
             ScenarioError: The result is not a valid scenario.
@@ -218,15 +209,11 @@ class ExperimentText(NamedTuple):
 
     @classmethod
     def read(cls, source: str | Path | Mapping[str, Any] | Scenario) -> "ExperimentText":
-        """Reads the description of an experiment as its author wrote it, without checking it.
+        """Reads the source of a scenario without validating it.
 
         Args:
-            source: One of the following: the name of a scenario in the package, the path of a
-                file, a TOML text, nested dictionaries of settings, or a `Scenario`.
-
-        Returns:
-            The description as a TOML text, with a name and the folder of the files that it
-            names.
+            source: Name of a scenario in the package, path of a file, TOML source, nested
+                dictionaries of settings, or a `Scenario`.
 
         Raises:
             ScenarioError: The source cannot be read.
@@ -243,30 +230,15 @@ class ExperimentText(NamedTuple):
         return ExperimentText(str(source), text, folder)
 
 
-def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """Returns the same experiment with other random numbers.
-
-    Numbers that the scenario states as distributions are drawn again.
-
-    Args:
-        scenario: The experiment.
-        seed: Seed of the random numbers. The same seed always gives the same numbers.
-
-    Raises:
-        ScenarioError: The seed is not valid, or a number that is drawn with it is out of range.
-    """
-    return load_scenario(scenario, {"seed": seed}) if scenario.seed != seed else scenario
-
-
 def _read_source(source: str | Path) -> tuple[str, Path]:
-    """Reads the TOML text of a scenario from the package or from a file.
+    """Reads the TOML source of a scenario from the package or from a file.
 
     Args:
-        source: Name of a scenario in the package, or a path. A text counts as a path if it ends
-            in ".toml" or contains a slash or backslash.
+        source: Name of a scenario in the package, or a path. Treated as a path if it ends in
+            ".toml" or contains a slash or backslash.
 
     Returns:
-        The text, and the folder with the files that the scenario names.
+        The TOML source, and the folder in which files named in the scenario are looked up.
 
     Raises:
         ScenarioError: The source cannot be read.
@@ -296,31 +268,33 @@ def parse_scenario(
     overrides: Mapping[str, Any] | Sequence[str] = (),
     folder: Path | None = Path(),
 ) -> Scenario:
-    """Converts the TOML text of a scenario to an object with a checked value for every key.
+    """Parses the TOML source of a scenario into a complete, validated `Scenario`.
 
     Args:
-        text: TOML text of a scenario file.
-        source: Name of the text, for error messages.
-        overrides: Changed keys, see `load_scenario`.
-        folder: Folder of the files that the text names. If None, a text that names a file is
-            refused.
+        text: Content of a scenario file.
+        source: Name of the source, for error messages.
+        overrides: Keys to change (see `load_scenario`).
+        folder: Folder in which files named in the scenario are looked up. If None, a scenario
+            that names a file is rejected.
 
     Raises:
-        ScenarioError: The text is not a valid scenario. The error contains the path of the key.
+        ScenarioError: The source is not a valid scenario. The error contains the path of the
+            key.
     """
     written: dict[str, Any] = {}
     with _PARSE_LOCK:
         try:
             tables = pickle.loads(_parse_toml(text))
             written = tables
-            pairs, entry_pairs = split_entries(tables, parse_overrides(overrides))
-            apply_overrides(tables, pairs)
+            parsed = ScenarioOverrides.parse(overrides)
+            applicable, waiting = parsed.split_entries(tables)
+            applicable.apply_to(tables)
             scenario = build_scenario(resolve_scenario(tables, folder))
-            if entry_pairs:
+            if waiting.pairs:
                 # The vectors of these entries exist only in the resolved scenario.
-                written = nest_overrides(entry_pairs)
+                written = waiting.nest()
                 tables = tomllib.loads(scenario.text)
-                apply_overrides(tables, expand_overrides(scenario, entry_pairs))
+                waiting.expand(scenario).apply_to(tables)
                 scenario = build_scenario(resolve_scenario(tables, folder))
             return scenario
         except ScenarioError as error:
@@ -332,31 +306,31 @@ def parse_scenario(
 
 @lru_cache(maxsize=4)
 def _parse_toml(text: str) -> bytes:
-    """Returns the tables of a TOML text, pickled.
+    """Parses TOML and returns the tables, pickled.
 
-    The runs of a study have the same text with different overrides. Copying the tables takes
-    far less time than parsing the text again.
+    The runs of a study share one source with different overrides. Copying the tables takes far
+    less time than parsing the source again.
 
     Raises:
-        ScenarioError: The text is not TOML, or has a key of very many parts.
+        ScenarioError: The text is not valid TOML, or contains a key with too many parts.
     """
     return pickle.dumps(parse_toml(text))
 
 
 def parse_embedded(text: str, source: str = "") -> Scenario:
-    """Converts the text of an experiment from a log or another process to a scenario.
+    """Parses a scenario that comes from a log or from another process.
 
-    Such a text is not trusted. A table for all links could repeat a long recording of delays
-    for every link. A short text would then fill the memory. Therefore the recordings of all
-    links together may not be longer than the text.
+    Such a source is not trusted. A short text could fill the memory, because a delay trace in
+    the table for all links is repeated for every link. The traces of all links together must
+    therefore not be longer than the text itself.
 
     Args:
-        text: TOML text of a resolved scenario, which names no files.
-        source: Name of the text, for error messages.
+        text: TOML source of a resolved scenario, which names no files.
+        source: Name of the source, for error messages.
 
     Raises:
-        ScenarioError: The scenario is not valid, names a file, or has traces of delays that are
-            together longer than its text.
+        ScenarioError: The scenario is not valid, names a file, or contains delay traces that
+            are together longer than the source.
     """
     scenario = parse_scenario(text, source, folder=None)
     changed_links = [change.after for change in scenario.timeline if change.link]
@@ -367,15 +341,3 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
             "the traces are not written out separately for every link", source=source
         )
     return scenario
-
-
-def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns a function that extracts the names of the arms from the text of an experiment.
-
-    The text may come from a log or another computer. Therefore it is not trusted, see
-    `parse_embedded`.
-
-    Args:
-        source: Name of the text, for error messages.
-    """
-    return lambda text: parse_embedded(text, source).names

@@ -1,8 +1,7 @@
-"""Defines the type of a complete scenario, in which every value is explicit.
+"""Types of a complete scenario, in which every value is explicit.
 
-A scenario describes an experiment. Each arm is controlled by a process called a site, and each
-pair of sites is connected by two directed links. `Scenario.setup` translates a scenario into
-the numbers from which the simulation kernel, the compiled control and simulation code, builds a
+Each pair of sites is connected by two directed links. `Scenario.setup` converts a scenario to
+the numbers from which the simulation kernel (the compiled control and simulation code) builds a
 site.
 
 Invariant:
@@ -11,19 +10,17 @@ Invariant:
 """
 
 import hashlib
-import re
+import math
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-import tomli_w
 from msgspec import Meta
 
 from ..core import (
-    ArmLinks,
     Array,
     CoreChange,
     DominanceMatrix,
@@ -39,66 +36,29 @@ from ..core import (
 )
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
-from ..laws import SentVectorSpecs
-from ..own_code import build_channel
+from ..laws import LawSettings, LawSituation, SentVectorSpecs, StabilityCondition
+from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, build_channel, list_named_code
 from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
-from .arms import START_MARGIN_RAD, Arm, ArmModel, build_arm, start_margin
+from .arms import START_MARGIN_RAD, ArmModel, build_arm, start_margin
+from .canonical_text import write_canonical_text
 from .change import Change
 from .delay_models import Link, LinkBase
+from .delay_models.kernel_delays import ConstantDelay
 from .distributions import Distribution
 from .expect import Expect
 from .laws import ChosenLaw
 from .own_plant import OwnPlant
 from .site_spec import SiteSpec
 
-_ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
-    **dict.fromkeys(("timeline", "environment"), ((), [])),
-    **dict.fromkeys(("expect", "drawn", "urdf", "on_stale", "task", "sends"), ({},)),
-    "plant": ("simulated",),
-    **dict.fromkeys(
-        ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)
-    ),
-}
-"""Values that mean the same as a missing key, for keys that were added in later versions.
-
-They are left out of the canonical text. Otherwise the text of an older scenario, and thereby
-its hash, would change.
-"""
 _POSE_NUMBERS = 7
 """Number of values of the pose of a body: three for the position, four for the quaternion."""
 _SLAVE_COLOUR = 2
-"""Index of the slave's colour in a palette."""
-_NUMBER_LIST = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
-"""Matches a list in which each number has its own line, as `tomli_w` writes lists."""
-
-
-def _drop_unused_keys(arm: dict[str, Any]) -> None:
-    """Removes the keys that have no effect from the table of an arm, in place.
-
-    These are the keys of the other kind of arm, and keys of a chain that have their default
-    values.
-    """
-    defaults = msgspec.to_builtins(Arm())
-    is_chain = bool(arm["urdf"])
-    unused_keys = ArmLinks._fields if is_chain else ()
-    kept_keys = () if is_chain else (*ArmLinks._fields, "g_m_s2")
-    for key, value in list(arm.items()):
-        if key in unused_keys or (key not in kept_keys and value == defaults[key]):
-            del arm[key]
-
-
-def _drop_absent_values(table: dict[str, Any]) -> None:
-    """Removes values from a table, in place, that mean the same as leaving their keys out."""
-    for key, absent_values in _ABSENT_VALUES.items():
-        if key in table and table[key] in absent_values:
-            del table[key]
-
-
-def _join_number_list(match: re.Match[str]) -> str:
-    """Returns a list of numbers, which TOML text spreads over several lines, on one line."""
-    return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
-
+"""Palette index of the slave's colour."""
+_LOOP_GROWS = ", but the roots of the sampled loop grow"
+"""Appended to the line about a satisfied condition if the sampled loop is unstable."""
+_SAMPLING_BREAKS = ", but sampling breaks it here: the roots of the sampled loop grow"
+"""The same, for a condition that proves decay in continuous time."""
 
 ScenarioName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]*\Z", max_length=64)]
 Duration = Annotated[float, Meta(gt=0.0, le=86_400.0)]
@@ -107,30 +67,28 @@ SchemeName = Literal["second_order", "digital"]
 
 
 class Scenario(Frozen, frozen=True, dict=True):
-    """Description of an experiment in which every value of every site and link is explicit.
-
-    A site is a process that runs one arm and its control loop, and a link is the directed
-    connection between two sites.
+    """A complete scenario, in which every value of every site and link is explicit.
 
     >>> tn.load_scenario("paper").names
     ('m1', 'm2', 's')
 
     Attributes:
         name: Name of the session and of its log file.
-        title: Title of one line.
-        about: Description of one paragraph.
-        assumed: Assumptions that the source of the experiment does not state.
+        title: One-line title.
+        about: One-paragraph description.
+        assumed: Assumptions made where the source of the experiment is silent.
         duration_s: Duration of the run, in s.
-        seed: Seed of the random numbers. Every random draw is a function of the seed.
-        scheme: Integration scheme: "second_order" or "digital", see `Scheme`.
-        sites: Sites by name, in order. The first one leads a live session.
-        dominance: Matrix of dominance factors, Eq. (6). The entry of row i and column j is the
+        seed: Random seed, of which every random draw is a function.
+        scheme: Integration scheme, "second_order" or "digital" (see `Scheme`).
+        sites: Ordered mapping from site name to site. The first site leads a live session.
+        dominance: Matrix of dominance factors, Eq. (6). The entry in row i and column j is the
             weight of site j in the reference of site i.
-        links: For every ordered pair of sites, the link from j to i, under the name "j->i".
+        links: Mapping from link name to link, with one link "j->i" for every ordered pair of
+            sites.
         timeline: Planned changes during the run.
-        expect: Conditions that a run must satisfy, see `trilat test`.
-        drawn: Distributions from which numbers were drawn, by the dotted key of the number.
-        urdf: Texts of the files that describe arms, by file name.
+        expect: Conditions that a run must satisfy (see `trilat test`).
+        drawn: Mapping from the dotted key of each drawn number to its distribution.
+        urdf: Mapping from file name to content of the URDF files of the arms.
     """
 
     name: ScenarioName
@@ -149,26 +107,24 @@ class Scenario(Frozen, frozen=True, dict=True):
     assumed: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Returns the state for a copy in another process, together with the canonical text.
+        """Returns the state for a copy in another process, including the canonical text.
 
-        msgspec leaves out a default if it is the same object as the default of the class. A
-        copy has equal but different objects, so its text would contain additional keys.
+        msgspec omits a default if it is the same object as the default of the class. A copy has
+        equal but distinct objects, so its text would contain additional keys.
         """
         return (*super().__reduce__(), {"text": self.text})
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the arms, such as ("m1", "m2", "s"), in the order of the scenario file.
+        """Names of the sites, such as ("m1", "m2", "s"), in the order of the scenario file.
 
-        An arm with its process is called a site. Arrays with an entry per site have this order.
+        Arrays with one entry per site use this order.
         """
         return tuple(self.sites)
 
     @cached_property
     def arms(self) -> dict[str, ArmModel]:
-        """Models of the arms, by the name of the site.
-
-        A model contains the parameters and the geometry of the arm.
+        """Mapping from site name to arm model, with its parameters and geometry.
 
         Raises:
             ScenarioError: The URDF file of an arm cannot be used.
@@ -188,11 +144,10 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def alpha(self) -> Array:
-        """Matrix of the weights with which the arms follow each other, shape (N, N), Eq. (6).
+        """Matrix of dominance factors at the start of the run, shape (N, N), Eq. (6).
 
-        The entry of row i and column j states how much arm i follows arm j at the start of the
-        run; it is called a dominance factor. An arm with the factor 0 for another arm does not
-        follow that arm.
+        The entry in row i and column j is the weight with which arm i follows arm j. It is 0 if
+        arm i does not follow arm j.
         """
         return np.array(
             [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
@@ -200,13 +155,12 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def has_irreversible_shares(self) -> bool:
-        """True if the weights with which the arms follow each other are irreversible.
+        """True if the dominance factors are irreversible.
 
-        The weight alpha_ij (dominance factor) states how much arm i follows arm j. The weights
-        are reversible if there is a diagonal matrix D > 0 for which D (I - alpha) is symmetric,
-        where I is the identity matrix. Some stability conditions require this. The value is
-        False if a control law exchanges more than positions or does not compensate gravity,
-        because the condition does not apply then.
+        The dominance factors alpha are reversible if there is a diagonal matrix D > 0 for which
+        D (I - alpha) is symmetric, where I is the identity matrix. Some stability conditions
+        require this. False if a control law exchanges more than positions or does not
+        compensate for gravity, because the condition does not apply in that case.
         """
         laws = [spec.control for spec in self.sites.values()]
         if not all(law.exchanges_positions() for law in laws):
@@ -215,58 +169,105 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
-        """Control law of every arm with its gains, in the order of the arms.
+        """Control law of every arm with its gains, in the order of the sites.
 
-        Some laws have gains that follow from the weights with which the arms follow each other
-        at the start. Here these gains are filled in.
+        Gains that a law derives from the initial dominance factors are filled in.
         """
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
+
+    def law_situations(self) -> Iterator[tuple[str, LawSettings, LawSituation]]:
+        """Yields each site with its control law and the quantities that affect stability.
+
+        These are the delays, the rates of the control loops, and the dominance factors. A law
+        with a stability condition evaluates the condition from them.
+        """
+        delay_s = np.zeros((len(self.names), len(self.names)))
+        for name, link in self.links.items():
+            sender, _, receiver = name.partition("->")
+            index = (self.names.index(receiver), self.names.index(sender))
+            delay_s[index] = link.find_effective_delay(self.sites[receiver].rate_hz)
+        hold_s = self._find_hold_time()
+        hands = tuple(site.find_hand_impedances() for site in self.sites.values())
+        for n, (name, site) in enumerate(self.sites.items()):
+            situation = LawSituation(
+                site=n,
+                names=self.names,
+                laws=self.controls,
+                alpha=self.alpha,
+                delay_s=delay_s,
+                tau_limit_nm=tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()),
+                rate_hz=site.rate_hz,
+                gravity_nm=self.arms[name].largest_gravity(site.arm.g_m_s2),
+                hold_s=hold_s,
+                hands=hands,
+                in_task_space=self.layout(name).task,
+            )
+            yield name, self.controls[n], situation
+
+    def _find_hold_time(self) -> float:
+        """Returns how long the torque of an arm is held constant, in s.
+
+        This is the control period for the integration scheme "digital", and 0 for other
+        schemes. NaN if the control loops have different rates.
+        """
+        if self.scheme != "digital":
+            return 0.0
+        periods_s = {1.0 / site.rate_hz for site in self.sites.values()}
+        return periods_s.pop() if len(periods_s) == 1 else math.nan
+
+    def describe_law_conditions(self, *, ticks_grow: bool = False) -> list[str]:
+        """Returns lines of text that say whether the stability conditions of the laws hold.
+
+        Every control law has its own conditions, for example on its gains and on the delays.
+        Sites with the same law and the same condition share one line.
+
+        Most conditions are proved for continuous-time controllers. A controller that acts once
+        per tick may be unstable even if its condition holds.
+
+        Args:
+            ticks_grow: True if the discrete-time loop is known to be unstable. The lines about
+                satisfied conditions then mention this.
+        """
+        owners: dict[tuple[str, StabilityCondition], list[str]] = {}
+        for name, law, situation in self.law_situations():
+            condition = law.condition(situation)
+            if condition:
+                owners.setdefault((law.tag, condition), []).append(name)
+        verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
+        lines = []
+        for (tag, condition), sites in owners.items():
+            verdict = verdicts[condition.holds]
+            line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
+            if ticks_grow and condition.holds:
+                line += _SAMPLING_BREAKS if condition.proves_decay else _LOOP_GROWS
+            lines.append(line)
+        return lines
 
     @property
     def beta(self) -> Array | None:
         """Weights of the sites in the energy function of the stability proof, shape (N,).
 
-        N is the number of sites, the processes of the arms. The dominance matrix alpha contains
-        the weights with which the sites follow each other. The weights beta are positive, have
-        the sum 1 and satisfy beta' alpha = beta', where the prime denotes the transpose. The
-        value is None if a site follows some other site neither directly nor through other
-        sites, because beta is not unique then.
+        The weights beta are positive, sum to 1 and satisfy beta' alpha = beta', where alpha is
+        the dominance matrix and the prime denotes the transpose. None if some site does not
+        follow some other site, either directly or through other sites, in which case beta is
+        not unique.
         """
         matrix = DominanceMatrix(self.alpha)
         return matrix.find_beta() if matrix.is_irreducible else None
 
     @cached_property
     def text(self) -> str:
-        """The scenario as a TOML text, in a unique (canonical) form.
+        """The scenario as TOML in canonical form.
 
-        Loading the text gives the same scenario. Keys without effect are left out, so that they
+        Loading the text gives the same scenario. Keys that have no effect are omitted, so they
         do not change the hash of the scenario.
         """
-        tables: dict[str, Any] = msgspec.to_builtins(self)
-        descriptions = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
-        descriptions = {key: value for key, value in descriptions.items() if value}
-        for site in tables["sites"].values():
-            _drop_unused_keys(site["arm"])
-
-        _drop_absent_values(tables)
-        for site in tables["sites"].values():
-            _drop_absent_values(site)
-            _drop_absent_values(site["control"])
-            _drop_absent_values(site["limits"])
-
-        # Texts for people may have several lines. Lists of numbers are written on one line.
-        urdf_texts = tables.pop("urdf", None)
-        description_text = tomli_w.dumps(descriptions, multiline_strings=True)
-        number_text = _NUMBER_LIST.sub(_join_number_list, tomli_w.dumps(tables))
-        urdf_text = ""
-        if urdf_texts:
-            urdf_text = tomli_w.dumps({"urdf": urdf_texts}, multiline_strings=True)
-        return description_text + number_text + urdf_text
+        return write_canonical_text(msgspec.to_builtins(self))
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 hash of the scenario's TOML text in its canonical form (`text`).
+        """SHA-256 hash of the canonical TOML form of the scenario (`text`).
 
         Two scenarios have the same hash only if they describe the same experiment. Sites
         compare hashes before they join a session.
@@ -274,19 +275,18 @@ class Scenario(Frozen, frozen=True, dict=True):
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def assign_colours(self, colours: int) -> list[int]:
-        """Chooses a colour for each arm, for figures.
+        """Chooses a colour for each arm in figures.
 
-        The slave, the arm that touches the environment, gets a fixed colour, so that it looks
-        the same in all figures. No other arm gets this colour before the slave. The other arms
-        get the first free colours.
+        The slave is given a fixed colour before all other arms, so it looks the same in all
+        figures. The other arms get the first free colours.
 
         Args:
             colours: Number of colours of the palette.
 
         Returns:
-            A permutation of the colours. The first entries belong to the sites in their order,
-            and further entries are not used. If there are more sites than colours, the caller
-            repeats the entries from the first one.
+            A permutation of the colour indices, whose first entries belong to the sites in
+            order. Any further entries are unused. If there are more sites than colours, the
+            caller repeats the sequence.
         """
         free = list(range(colours))
         assigned = []
@@ -305,9 +305,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return [*assigned, *free]
 
     def ticks(self, site: str) -> int:
-        """Returns how many ticks a site executes in the whole run.
-
-        A tick is one period of the site's control loop.
+        """Returns how many ticks a site executes in a complete run.
 
         Args:
             site: Name of the site.
@@ -315,10 +313,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return max(1, round(self.duration_s * self.sites[site].rate_hz))
 
     def peers(self, site: str) -> tuple[str, ...]:
-        """Returns the names of all arms but one, in the order of the scenario.
+        """Returns the peers of a site: the names of all other sites, in scenario order.
 
-        They are called the peers of this arm's process (site). Arrays with an entry per peer
-        have this order. An arm that is not followed is included.
+        Includes arms that this one does not follow. Arrays with one entry per peer use this
+        order.
 
         Args:
             site: Name of the site whose peers are returned.
@@ -326,7 +324,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def find_site(self, name: str) -> SiteSpec:
-        """Returns a site, an arm with its control loop, by its name.
+        """Returns the site with the given name.
 
         Args:
             name: Name of the site.
@@ -345,22 +343,22 @@ class Scenario(Frozen, frozen=True, dict=True):
         return self.sites[name]
 
     def scheduled_links(self, name: str) -> Iterator[tuple[int, LinkBase]]:
-        """Yields the settings that a link takes during the run because of planned changes.
+        """Yields the settings of a link after each planned change.
 
-        The settings at the start of the run are not included.
+        Excludes the settings at the start of the run.
 
         Args:
             name: Name of the link, for example "m1->s".
 
         Yields:
-            The send time of the first affected sample, in ns after the epoch, and the link.
+            Send time of the first affected sample, in ns after the epoch, and the link.
         """
         for change in self.timeline:
             if change.link == name:
                 yield change.start_ns, change.after
 
     def _all_links(self) -> list[LinkBase]:
-        """Returns the settings of all network links, at the start and after planned changes.
+        """Returns the settings of all links, both initially and after planned changes.
 
         For example, a run is random if any of these settings has random delays.
         """
@@ -369,34 +367,34 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def random(self) -> bool:
-        """True if any number of the experiment is random, so that the seed changes the run.
+        """True if the run depends on the seed.
 
-        The numbers may be drawn when the scenario is loaded, or during the run.
+        Random numbers may be drawn either when the scenario is loaded or during the run.
         """
         return bool(self.drawn) or self.links_random
 
     @property
     def links_random(self) -> bool:
-        """True if a link draws its delays, losses or duplicates at random during the run.
+        """True if a link has random delays, losses or duplicates at any time during the run.
 
-        A link also counts if it has such draws only after a planned change. Results then depend
-        on the seed, and one run is only an example.
+        Includes links that become random through a planned change. Results then depend on the
+        seed, and a single run is only an example.
         """
         return any(link.random for link in self._all_links())
 
     @property
     def measured(self) -> bool:
-        """True if at least one network link is delayed only by the real network.
+        """True if at least one link is delayed only by the real network.
 
-        Such an experiment cannot be simulated.
+        Such a scenario cannot be simulated.
         """
         return any(link.measured for link in self._all_links())
 
     @property
     def external(self) -> tuple[str, ...]:
-        """Names of the sites whose arms the program does not simulate itself.
+        """Names of the sites whose arms are not simulated by the program itself.
 
-        Such an arm is a real robot, or a user's class computes its motion.
+        Such an arm is either a real robot or simulated by a user's class.
         """
         return tuple(name for name, spec in self.sites.items() if spec.plant != "simulated")
 
@@ -404,25 +402,25 @@ class Scenario(Frozen, frozen=True, dict=True):
     def slave(self) -> str:
         """Name of the slave, the arm that touches the environment.
 
-        If several arms have the role "slave", it is the first of them. If no arm has this role,
-        it is the last arm of the experiment.
+        The first arm with the role "slave", or the last arm of the scenario if no arm has this
+        role.
         """
         slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
         return slaves[0] if slaves else self.names[-1]
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Names of the sites whose arms are real robots, with motion that is measured.
+        """Names of the sites whose arms are real robots, with measured motion.
 
-        A simulation cannot run these sites. Empty if there are none.
+        A simulation cannot run these sites.
         """
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
 
     @property
     def simulated_settings(self) -> dict[str, Any]:
-        """Settings that must change to run the experiment with simulated arms only.
+        """Overrides that make the scenario run with simulated arms only.
 
-        The value is the new value of each key, by the dotted name of the key. The masses of a
+        A mapping from dotted key to new value. The overrides are needed because the masses of a
         simulated arm are known, and only a real arm has a dead-man switch.
         """
         settings: dict[str, Any] = {}
@@ -437,9 +435,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def simulated_options(self) -> str:
-        """Command-line options that run the experiment with simulated arms only.
+        """Command-line options that run the scenario with simulated arms only.
 
-        Error messages suggest these options `--set` when an experiment with real arms cannot be
+        Error messages suggest these `--set` options when a scenario with real arms cannot be
         simulated.
         """
         options = []
@@ -449,14 +447,13 @@ class Scenario(Frozen, frozen=True, dict=True):
         return " ".join(options)
 
     def refuse_external_arms(self, exempt: Collection[str] = ()) -> None:
-        """Refuses an experiment with arms that the program does not simulate itself.
+        """Raises ScenarioError if the program does not simulate all arms itself.
 
-        Such an arm is either a real robot outside of the program, or a user's class computes
-        its motion.
+        An external arm is either a real robot or simulated by a user's class.
 
         Args:
-            exempt: Names of sites whose arms may be external, because a log contains their
-                motion.
+            exempt: Names of sites whose arms may be external because their motion is read from
+                a log.
 
         Raises:
             ScenarioError: The arm of another site is external.
@@ -477,13 +474,11 @@ class Scenario(Frozen, frozen=True, dict=True):
             raise ScenarioError(problem, path=f"sites.{name}.plant", source=self.name)
 
     def refuse_live_only(self) -> None:
-        """Refuses an experiment that only a live session can run.
-
-        A live session has a real network, and may have real robots.
+        """Raises ScenarioError if the scenario can only be run as a live session.
 
         Raises:
-            ScenarioError: An arm is external, or a link has the model "measured", with which
-                the real network determines the delay. In virtual time there is no real network.
+            ScenarioError: An arm is external, or a link has the model "measured", whose delay
+                is that of the real network. In virtual time, there is no real network.
         """
         self.refuse_external_arms()
         if not self.measured:
@@ -499,11 +494,44 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     @property
+    def imported_code(self) -> list[tuple[str, str]]:
+        """Users' Python classes that the scenario uses: laws, operators and plants.
+
+        Each item is the name of a class, such as "mylaws:Spring", and the SHA-256 hash of its
+        file.
+        """
+        named = [(code.code, code.source_sha256) for code in list_named_code(self)]
+        return list(dict.fromkeys(named))
+
+    @cached_property
+    def user_laws(self) -> dict[str, ImportedLaw]:
+        """Mapping from site name to control law, for laws that are users' Python classes.
+
+        Empty if all laws are built in.
+        """
+        laws = {name: spec.user_law for name, spec in self.sites.items()}
+        return {name: law for name, law in laws.items() if law is not None}
+
+    def inspect_user_laws(self) -> list[LoggedUserLaw]:
+        """Describes the control laws that are users' classes, without running their code.
+
+        Each entry states whether the law may run and which file would be used. Files and
+        permissions are read again on each call.
+        """
+        sites: dict[CodeKey, list[str]] = {}
+        for name, law in self.user_laws.items():
+            sites.setdefault(CodeKey.of(law), []).append(name)
+        return [
+            LoggedUserLaw.inspect(self.user_laws[names[0]], tuple(names))
+            for names in sites.values()
+        ]
+
+    @property
     def open_hands(self) -> tuple[str, ...]:
         """Names of the sites whose arms any member of the session may move.
 
-        A member is a process that takes part in the session, such as a page or a bridge. The
-        arm of a user's program is not open, because only that program moves the arm.
+        A member is a process that takes part in the session, such as a page or a bridge. Arms
+        operated by a user's program are excluded, since only that program moves them.
         """
         return tuple(
             name
@@ -513,18 +541,18 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def sites_may_return(self) -> bool:
-        """True if the process of an arm may leave a live session and return to it.
+        """True if a site may leave a live session and return to it.
 
-        This requires the rule "glide" at every arm, see `OnStale`: the other arms come to rest,
-        and follow the returning arm smoothly.
+        Requires the stale rule "glide" at every arm (see `OnStale`): the other arms come to
+        rest and then follow the returning arm smoothly.
         """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
     def draw_seed(self, site: str) -> int:
-        """Returns the seed with which a user's code at one arm should draw random numbers.
+        """Returns the random seed for user code at one site.
 
-        It depends on the seed of the experiment and the name of the arm, so that arms with the
-        same code draw different numbers.
+        Derived from the seed of the scenario and the name of the site, so sites with the same
+        code draw different numbers.
 
         Args:
             site: Name of the site.
@@ -532,7 +560,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns the vectors that the control law of an arm sends to others, in their order.
+        """Returns the additional vectors that the control law of a site sends to its peers.
 
         Most laws send nothing but the state of the arm. A law that sends waves, for example,
         has a vector for them.
@@ -547,8 +575,7 @@ class Scenario(Frozen, frozen=True, dict=True):
     def layout(self, site: str) -> Layout:
         """Returns the lengths of all vectors in the log of a site.
 
-        The log of a site, the process that runs one arm, has one entry for each control period.
-        An entry contains vectors such as the joint angles and the torques.
+        Each record of the log contains vectors such as joint angles and torques.
 
         Args:
             site: Name of the site.
@@ -561,27 +588,25 @@ class Scenario(Frozen, frozen=True, dict=True):
         return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
-        """Returns the sizes of the objects that a user's plant moves in addition to the arm.
+        """Returns the sizes of the bodies that a plant moves in addition to the arm, in m.
 
-        A plant is a program that computes the motion of the arm of a site. For example, the arm
-        may push a box.
+        For example, the arm may push a box.
 
         Args:
             site: Name of the site.
 
         Returns:
-            Extents of each body along its own axes x, y and z, in m, by name. Empty if there
-            are none.
+            Mapping from body name to its extents along its own axes x, y and z, in m. Empty if
+            there are none.
         """
         plant = self.sites[site].plant
         return plant.bodies if isinstance(plant, OwnPlant) else {}
 
     def setup(self, site: str) -> SiteSetup:
-        """Returns all settings from which the compiled control loop of a site is built.
+        """Returns the settings from which the compiled control loop of a site is built.
 
-        A site is the process that runs one arm. The result contains its arm, control law,
-        network connections and limits. The result is cached, because both the check of a
-        scenario and the run need it.
+        They include the arm, control law, network links and limits of the site. The result is
+        cached, since both the validation of a scenario and the run need it.
 
         Args:
             site: Name of the site.
@@ -592,11 +617,11 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def _setups(self) -> dict[str, SiteSetup]:
-        """The results of earlier calls of `setup`, by the name of the site."""
+        """Cache of `setup`: mapping from site name to result."""
         return {}
 
     def _build_setup(self, site: str) -> SiteSetup:
-        """Builds the settings that `setup` returns and caches.
+        """Builds the settings returned and cached by `setup`.
 
         Args:
             site: Name of the site.
@@ -636,11 +661,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def motion_limits(self, site: str) -> MotionLimits:
-        """Returns the limits of an arm's motion during a run.
+        """Returns the limits on the motion of an arm during a run.
 
-        A joint may start a little beyond `q_min_rad` or `q_max_rad`, up to a margin. For such a
-        joint, the limit on that side is moved outward by the margin for the whole run, so that
-        the arm does not stop at once.
+        A joint may start beyond `q_min_rad` or `q_max_rad` by up to a small margin. In that
+        case, the limit on that side is moved outward by the margin for the entire run, so that
+        the arm does not stop immediately.
 
         Args:
             site: Name of the site.
@@ -664,11 +689,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def gains(self, site: str) -> Gains:
-        """Returns the gains of a site's control law, as the record that the control loop reads.
+        """Returns the gains of a site's control law, in the form read by the control loop.
 
-        A site is the process that runs one arm. If the law is adaptive, it estimates the
-        parameters of the arm. If the site can also be stopped smoothly (its setting
-        `on_stale.action` is "glide"), the record contains bounds of these estimates.
+        If the law is adaptive and the site can stop smoothly (`on_stale.action` is "glide"),
+        the record includes bounds on the estimated parameters.
 
         Args:
             site: Name of the site.
@@ -683,9 +707,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def _rest_gains(self, site: str) -> RestGains:
         """Returns the gains of the controller that brings an arm to rest.
 
-        This controller acts, for example, when another arm has fallen silent. The gains depend
-        on the inertia of the arm, its largest torque, the control period, and the damping of
-        the control law.
+        This controller acts, for example, when a peer has fallen silent. The gains depend on
+        the inertia of the arm, its torque limits, the control period, and the damping of the
+        control law.
         """
         spec = self.sites[site]
         arm = self.arms[site]
@@ -701,9 +725,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _link_setup(self, peer: str, site: str) -> LinkSetup:
-        """Returns the network link between two arms in the format of the compiled simulation.
+        """Returns the link between two sites in the format read by the compiled simulation.
 
-        It includes the planned changes of the link.
+        Includes the planned changes of the link.
 
         Args:
             peer: Name of the sender.
@@ -738,17 +762,17 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def _followed_sites(self, index: int) -> int:
-        """Returns the arms that an arm follows, as an integer with bit n set for arm n.
+        """Returns the sites that a site follows, as a bit mask with bit n set for site n.
 
-        For example, 0b101 stands for the first and the third arm. The compiled code needs this
-        compact form.
+        For example, 0b101 stands for the first and the third site. The compiled code requires
+        this form.
         """
         return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the largest speed of each joint of an arm, in rad/s.
+        """Returns the speed limit of each joint of an arm, in rad/s.
 
-        The result is empty if the arms follow each other's end effectors.
+        Empty if the arms follow each other's end effectors.
         """
         spec = self.sites[site]
         joints = self.arms[site].counts.joints
@@ -759,15 +783,11 @@ class Scenario(Frozen, frozen=True, dict=True):
     def ramp(
         self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float
     ) -> DominanceRamp:
-        """Returns a gradual change of the weights with which a site follows the others.
-
-        A site is the process that runs one arm. The result is the record that the compiled
-        control loop reads.
+        """Returns a gradual change of dominance factors, in the form read by the control loop.
 
         Args:
-            site: Name of the site.
-            shares: Weights after the change, by name of the followed site. A site that is
-                missing gets the weight 0.
+            site: Name of the site whose dominance factors change.
+            shares: Mapping from peer name to the factor after the change; missing peers get 0.
             start_ns: Start of the change, in ns after the common start time of all sites.
             ramp_s: Duration of the linear transition, in s.
         """
@@ -775,15 +795,13 @@ class Scenario(Frozen, frozen=True, dict=True):
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
-        """Returns the planned changes of the weights with which one arm follows the others.
-
-        The weights are called dominance factors, and change gradually (ramps).
+        """Returns the planned changes of a site's dominance factors.
 
         Args:
             site: Name of the site.
 
         Returns:
-            The changes as records that the kernel reads. Empty if none is planned.
+            The changes in the form read by the kernel. Empty if none are planned.
         """
         return [
             self.ramp(site, change.to, change.start_ns, change.ramp_s)
@@ -794,20 +812,20 @@ class Scenario(Frozen, frozen=True, dict=True):
     def make_site_order(
         self, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
     ) -> Change:
-        """Converts a command to an arm's process, such as stop, to a change of the run.
+        """Converts a command to a site, such as stop, to a `Change`.
 
-        In this form it can be sent and logged like a change of the network.
+        In this form, the command can be sent and logged like a change of the network.
 
         Args:
             site: Name of the site that must carry out the command.
             order: The command, for example "stop".
-            from_ns: Time of the control period in which the site carries it out, in ns after
+            from_ns: Time of the control period in which the command is carried out, in ns after
                 the common start time of all sites.
-            ticks: For the command "overrun": number of control periods that the site missed.
+            ticks: Number of control periods that the site missed, for the command "overrun".
 
         Raises:
-            ScenarioError: The site cannot stop and go on smoothly, because its setting
-                `on_stale.action` is not "glide".
+            ScenarioError: The site cannot stop and resume smoothly, because `on_stale.action`
+                is not "glide".
         """
         action = self.sites[site].on_stale.action
         if action != "glide":
@@ -818,11 +836,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return Change(at_s=from_ns / NS_PER_S, site=site, order=order, ticks=ticks)
 
     def to_core_change(self, change: Change) -> CoreChange:
-        """Converts a change during a run to the form that the compiled control loop reads.
+        """Converts a change to the form read by the compiled control loop.
 
         Args:
-            change: Change of a link or of the weights with which a site follows the others, or
-                a command to a site.
+            change: Change of a link or of a site's dominance factors, or a command to a site.
         """
         text = msgspec.json.encode(change).decode()
         site = change.owner
@@ -838,11 +855,23 @@ class Scenario(Frozen, frozen=True, dict=True):
             model=change.after.to_core_model(change.start_ns),
         )
 
-    def without_hands(self) -> "Scenario":
-        """Returns the same experiment without the persons or programs who move the arms.
+    def with_constant_delays(self, delays_ms: Mapping[str, float]) -> "Scenario":
+        """Returns a copy of the scenario with constant delays on some links.
 
-        Walls and other environments remain. Values that were drawn at random for operators are
-        left out of the list of drawn values.
+        Planned changes of these links are dropped.
+
+        Args:
+            delays_ms: Mapping from link name to delay in ms.
+        """
+        links = {name: ConstantDelay(delay_ms=delay_ms) for name, delay_ms in delays_ms.items()}
+        timeline = tuple(change for change in self.timeline if change.link not in delays_ms)
+        return msgspec.structs.replace(self, links={**self.links, **links}, timeline=timeline)
+
+    def without_hands(self) -> "Scenario":
+        """Returns a copy of the scenario with no operators.
+
+        Walls and other environments are kept. Values drawn at random for operators are removed
+        from `drawn`.
         """
         sites = {
             name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()

@@ -1,12 +1,12 @@
-"""Simulates an arm step by step, for programs that stand in for a robot.
+"""Simulates an arm step by step, for use in place of a robot.
 
-For example, a test of a robot driver can use `SimulatedArm` instead of the robot. It computes
-the joint accelerations from torques and integrates them over time, with the masses and the
-geometry that a scenario (the description of an experiment) states.
+For example, the test of a robot driver can use `SimulatedArm` instead of the robot. It computes
+joint accelerations from torques and integrates them over time, using the masses and geometry of
+a scenario.
 
 Invariant:
-    - The arm obeys the equation of motion that the scenario's arm obeys in a run, Eq. (8) of
-      the project. A planar arm is simulated as a chain of two joints.
+    - The arm obeys the same equation of motion as the scenario's arm in a run, Eq. (8) of the
+      project. A planar arm is simulated as a chain of two joints.
 """
 
 import numpy as np
@@ -18,9 +18,9 @@ from .scenario_types import Scenario
 
 
 class SimulatedArm:
-    """Simulation of one arm, for users' programs that compute the motion of an arm.
+    """Simulation of one arm, for use in plants and tests.
 
-    It starts in the start pose of its site, and moves when a program calls `move`.
+    Starts in the start pose of its site and moves only when `move` is called.
 
     >>> arm = tn.SimulatedArm(tn.load_scenario("two_sites"), "s")
     >>> arm.move([0.0, 0.0], 0.001)
@@ -30,13 +30,13 @@ class SimulatedArm:
     Args:
         scenario: The scenario.
         site: Name of the site whose arm is simulated.
-        heavier: Factor by which all masses and inertias are multiplied.
+        heavier: Scale factor for all masses and inertias.
 
     Attributes:
         q: Joint angles in rad, or positions in m for prismatic joints, shape (n,).
         qd: Joint velocities in rad/s or m/s, shape (n,).
         chain: Joints, gravity and end effector of the arm.
-        theta: Inertial parameters of the links, ten per link, see `core.chain`.
+        theta: Inertial parameters of the links, ten per link (see `core.chain`).
 
     Raises:
         ScenarioError: There is no such site.
@@ -54,7 +54,7 @@ class SimulatedArm:
 
     @property
     def theta(self) -> Array:
-        """Inertial parameters of the links, ten per link, see `core.chain`."""
+        """Inertial parameters of the links, ten per link (see `core.chain`)."""
         return self._theta
 
     @theta.setter
@@ -63,10 +63,10 @@ class SimulatedArm:
         self._dynamics = ChainDynamics(self.chain, theta)
 
     def accelerate(self, torque: ArrayLike) -> Array:
-        """Computes the joint accelerations that a torque would cause, without moving the arm.
+        """Computes the joint accelerations under a torque, without moving the arm.
 
         Args:
-            torque: Torque that acts ON the joints, in N m, shape (n,).
+            torque: Torque ON the joints, in N m, shape (n,).
 
         Returns:
             Accelerations in rad/s^2 or m/s^2, shape (n,).
@@ -75,13 +75,13 @@ class SimulatedArm:
         return self._dynamics.find_acceleration(self.q, self.qd, torque_on_joints)
 
     def move(self, torque: ArrayLike, period_s: float) -> None:
-        """Simulates the motion of the arm for one period under a constant torque.
+        """Advances the simulation by one period under constant torque.
 
-        The integration is semi-implicit (symplectic Euler): first the velocities are advanced,
-        then the angles with the new velocities.
+        Uses the semi-implicit Euler method: the velocities are advanced first, and the new
+        velocities then advance the angles.
 
         Args:
-            torque: Torque that acts ON the joints, in N m, shape (n,).
+            torque: Torque ON the joints, in N m, shape (n,).
             period_s: Duration of the step, in s.
         """
         self.qd += period_s * self.accelerate(torque)

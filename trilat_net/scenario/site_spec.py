@@ -1,6 +1,4 @@
-"""Defines the types that describe one site of a scenario: its arm, law, limits and operators.
-
-A scenario describes an experiment. A site is the process that runs one of its arms.
+"""Types that describe one site of a scenario: its arm, law, limits and operators.
 
 Invariant:
     - The name of a key ends in its unit. Symbols are those of the paper on which the project is
@@ -14,8 +12,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from ..core import Array, MotionLimits, StaleAction, StaleRule
+from ..core import SCRIPTED_KINDS, Array, MotionLimits, StaleAction, StaleRule, TorqueKind
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
+from ..laws import ArmLoad
 from ..own_code import ImportedLaw
 from ..records import MAX_JOINTS
 from .arms import Arm, Task
@@ -28,28 +27,26 @@ from .own_plant import OwnPlant
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """What an arm does if the messages of another arm are too old or missing.
-
-    Every arm's process (site) sends its state, a sample, in each period of its control loop.
+    """Stale rule: how a site reacts if the samples of a peer are too old or missing.
 
     Attributes:
-        action: What the site does. "use": The site continues with the old sample. "hold": The
-            site keeps its last reference. "brake": The site holds the present position of its
-            arm. "glide": At the start, the site waits for all peers. If no sample of a peer has
-            come into use for `silence_ms`, its reference decelerates to rest. Later it aligns
-            with its peers without a jump.
-        age_ms: Age of a sample beyond which it is too old, in ms. Not used by "glide".
-        return_s: Duration of the return to the reference after a fresh sample has come into
-            use, in s. Not used by "glide".
-        silence_ms: For "glide": time without a new sample in use after which a peer counts as
-            silent, in ms.
-        align_speed_rad_s: For "glide": speed with which the site moves to its peers, in rad/s,
-            or in m/s if the sites share a position.
-        align_limit_rad: For "glide": longest path that the site moves by itself, in rad, or in
-            m if the sites share a position.
-        on_lost: For "glide": reaction to a silent peer. "hold": The site waits for the peer.
-            "degrade": The site continues without a silent master, as long as the remaining
-            sites all reach each other.
+        action: "use" to continue with the old sample, "hold" to keep the last reference,
+            "brake" to hold the current position of the arm, or "glide". With "glide", the site
+            waits for all peers at the start. If no new sample of a peer is used for
+            `silence_ms`, the reference decelerates to rest; later, the site realigns with its
+            peers without a jump.
+        age_ms: Age beyond which a sample is too old, in ms. Not used by "glide".
+        return_s: Duration of the return to the reference once a fresh sample is used, in s. Not
+            used by "glide".
+        silence_ms: For "glide": time without a new sample after which a peer counts as silent,
+            in ms.
+        align_speed_rad_s: For "glide": speed at which the site moves towards its peers, in
+            rad/s (m/s if the sites share positions).
+        align_limit_rad: For "glide": longest distance that the site moves on its own, in rad (m
+            if the sites share positions).
+        on_lost: For "glide": reaction to a silent peer: "hold" to wait for the peer, or
+            "degrade" to continue without a silent master as long as the remaining sites can all
+            reach each other.
     """
 
     action: Literal["use", "hold", "brake", "glide"] = "use"
@@ -62,9 +59,9 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> StaleRule:
-        """What to do if messages of another arm are missing, as the control loop reads it.
+        """The stale rule in the form read by the control loop.
 
-        Times are converted from ms to whole ns, because the compiled code computes with
+        Times are converted from ms to integers in ns, since the compiled code computes with
         integers.
         """
         if self.action == "glide":
@@ -94,9 +91,9 @@ SharedSpeedLimits = Annotated[
 
 
 GLIDE_TAU_RATE_NM_S = 1000.0
-"""Default limit of the torque's rate of change under the stale rule "glide", in N m/s.
+"""Default limit on the torque's rate of change under the stale rule "glide", in N m/s.
 
-It is the limit of Franka's arms, 1 N m per millisecond.
+This is the limit of Franka arms, 1 N m per millisecond.
 """
 
 
@@ -106,25 +103,25 @@ def _or_infinity(limit: Any) -> Any:
 
 
 class Limits(Frozen, frozen=True):
-    """Limits of one arm, such as its largest torque, for all joints together or for each.
+    """Limits of one arm, such as its largest torque, given per joint or for all joints.
 
-    If a limit is exceeded, the run ends. Under the rule "glide" for silent arms, only this arm
-    is brought to rest instead.
+    Exceeding a limit ends the run or, under the stale rule "glide", only brings this arm to
+    rest.
 
     Attributes:
-        tau_limit_nm: Largest control torque of a joint, in N m. A larger torque is cut off. By
-            default, the efforts in the URDF file of a chain.
-        qd_limit_rad_s: Joint speed beyond which a run counts as diverged and ends, in rad/s.
-            Under the stale rule "glide", only the site stops with a fault, and the run
-            continues. By default, the speeds in the URDF file of a chain.
-        tau_rate_limit_nm_s: Largest rate of change of a joint's control torque, in N m/s. By
-            default, there is no limit, except under the stale rule "glide", where it is
+        tau_limit_nm: Largest control torque of a joint, in N m. The torque is clipped to this
+            value. By default, the effort limits in the URDF file of a chain.
+        qd_limit_rad_s: Joint speed beyond which a run is considered diverged and ends, in
+            rad/s. Under the stale rule "glide", the site stops with a fault and the run
+            continues. By default, the velocity limits in the URDF file of a chain.
+        tau_rate_limit_nm_s: Largest rate of change of a joint's control torque, in N m/s.
+            Unlimited by default, except under the stale rule "glide", where the default is
             `GLIDE_TAU_RATE_NM_S`.
-        qd_des_limit_rad_s: Largest speed of the reference, in rad/s, or in m/s if the sites
-            share a position.
-        q_min_rad: Smallest angle of a joint, in rad. Beyond it, the site stops with a fault.
+        qd_des_limit_rad_s: Largest speed of the reference, in rad/s (m/s if the sites share
+            positions).
+        q_min_rad: Smallest angle of a joint, in rad. The site stops with a fault below it.
             Allowed only under the stale rule "glide".
-        q_max_rad: Largest angle of a joint, in rad. Like `q_min_rad`.
+        q_max_rad: Largest angle of a joint, in rad, analogous to `q_min_rad`.
     """
 
     tau_limit_nm: Positive | PositiveJoints = 200.0
@@ -136,9 +133,9 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> MotionLimits:
-        """Limits of angles, reference speed and torque rate, as the control loop reads them.
+        """Limits on angles, reference speed and torque rate, as read by the control loop.
 
-        A limit that the author left out is infinite, so the loop needs no special case.
+        Limits that the author left out are infinite, so the loop needs no special case.
         """
         return MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -148,10 +145,7 @@ class Limits(Frozen, frozen=True):
         )
 
     def find_unlimited_rows(self, qd_des: Array) -> NDArray[np.bool_]:
-        """Marks the records in which no speed limit restricts the motion that the arm follows.
-
-        The motion that an arm follows is called its reference. Its velocity is limited in each
-        of the n coordinates.
+        """Marks the records in which the speed limit does not restrict the reference.
 
         Args:
             qd_des: Velocity of the reference in rad/s, shape (K, n) for K records or (n,) for a
@@ -166,30 +160,27 @@ class Limits(Frozen, frozen=True):
 
 
 class SiteSpec(Frozen, frozen=True):
-    """Description of a site in a scenario: an arm with its control loop.
-
-    A site is a process that runs one arm. Its peers are the other sites whose states it
-    receives.
+    """Description of a site in a scenario: an arm and its control loop.
 
     Attributes:
-        role: Role of the site for people who read figures, and for the stale rule "degrade". It
-            enters no formula.
+        role: Role of the site, shown in figures and used by the stale rule "degrade". Does not
+            enter any formula.
         rate_hz: Tick rate of the control loop, in Hz.
         q0_rad: Start pose, in rad.
         qd0_rad_s: Start velocity, in rad/s.
         arm: Arm of the site.
         control: Control law and its gains.
-        limits: Limits of torques, speeds and positions.
+        limits: Limits on torques, speeds and positions.
         on_stale: Reaction if the samples of a peer are too old or missing.
         task: Coordinates that the site shares with its peers: its joint angles, or the pose of
             its end effector.
-        hands: Operators: persons or programs who move the arm.
+        hands: Operators: people or programs that move the arm.
         environment: Walls and other bodies that act on the arm.
-        plant: Who moves the arm. "simulated": The program. "external": A real robot, whose
-            state is measured. Otherwise a user's class, which computes the motion.
+        plant: "simulated" for the built-in simulation, "external" for a real robot whose state
+            is measured, or a user's class that computes the motion.
         view: Delay, loss and order of the picture in which the user of the site sees the other
-            arms. It has the keys of a link. None if the user sees the samples that the
-            controller uses. The view enters no formula.
+            arms. Has the keys of a link. None if the user sees the samples that the controller
+            uses. Does not enter any formula.
     """
 
     role: Literal["master", "slave"]
@@ -210,32 +201,60 @@ class SiteSpec(Frozen, frozen=True):
     def law_name(self) -> str:
         """Name by which a scenario file selects the control law of the site.
 
-        The name of a user's law consists of its module and class, for example
-        "package.module:Law".
+        For a user's law, this is the module and class, for example "package.module:Law".
         """
-        law: Any = self.control
-        return law.code if isinstance(law, ImportedLaw) else str(law.tag)
+        return str(self.control.tag) if self.user_law is None else self.user_law.code
+
+    @property
+    def user_law(self) -> ImportedLaw | None:
+        """Control law of the site if it is a user's Python class; None if it is built in."""
+        return self.control if isinstance(self.control, ImportedLaw) else None
 
     @property
     def has_program_hand(self) -> bool:
-        """True if a program of the user operates the arm (a hand of kind "own").
+        """True if a user's program operates the arm (a hand of kind "own").
 
-        Such a program may react to the motion of the arm. A linearised loop does not contain
-        this reaction, unlike that of an operator whom the scenario describes.
+        Such a program may react to the motion of the arm. Unlike the reaction of an operator
+        described in the scenario, this reaction is not part of the linearised loop.
         """
         return any(isinstance(hand, ProgramHand) for hand in self.hands)
 
-    def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
-        """Finds the operator of the site who may move the arm while the session runs.
+    def find_hand_impedances(self) -> tuple[ArmLoad, ...] | None:
+        """Returns the impedances of all operators and environments that react to motion.
 
-        An operator is a person or program that moves the arm.
-
-        Args:
-            is_open: If True, an operator counts only if any member of the session may take the
-                role.
+        Excludes operators whose torque depends on time alone.
 
         Returns:
-            The operator. None if the site has no such operator.
+            The spring and the damper of each. None if the reaction depends on the pose (because
+            an operator acts on the end effector), or is unknown (for a live operator or a
+            program).
+        """
+        impedances = []
+        for actor in (*self.hands, *self.environment):
+            source = actor.actor
+            if source.kind in SCRIPTED_KINDS:
+                continue
+            # A sampled torque lags behind the motion, so it is not that of a spring and damper.
+            if source.kind not in (TorqueKind.HAND, TorqueKind.VISCOUS) or source.sampled:
+                return None
+            joints = len(self.q0_rad)
+            stiffness = source.K or (0.0,)
+            impedance = ArmLoad(
+                stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
+                damping_nm_s_rad=tuple(np.broadcast_to(source.B, joints).tolist()),
+            )
+            impedances.append(impedance)
+        return tuple(impedances)
+
+    def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
+        """Returns the operator who may move the arm while the session runs.
+
+        Args:
+            is_open: If True, only consider an operator whose role any member of the session may
+                take.
+
+        Returns:
+            The operator, or None if the site has no such operator.
         """
         for hand in self.hands:
             if isinstance(hand, LiveHand) and (hand.is_open or not is_open):
@@ -249,4 +268,4 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
     "on_stale": OnStale,
     "task": Task,
 }
-"""Groups of keys that may be written once for all sites and again for one site, by table."""
+"""Groups of keys that may be set for all sites and overridden for individual ones, by table."""

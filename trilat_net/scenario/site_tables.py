@@ -1,24 +1,27 @@
-"""Completes the tables of the sites of a scenario: arms, control laws, limits, operators.
+"""Completes the site tables of a scenario: arms, control laws, limits, operators.
 
-A scenario is a TOML file that describes an experiment. A site is a process that runs one arm.
-Its author may state keys once for all sites, in tables such as `[arm]`, and again for a single
-site.
+Keys may be specified for all sites at once, in tables such as `[arm]`, and overridden for
+individual sites. The law of an arm is either the name of a built-in law or a user's Python
+class, given as "module:Class".
 
-The names, types and ranges of all keys have been checked before, see `written_tables`. Only
-random numbers can still be out of range, since they are drawn here.
+Names, types and ranges of all keys have already been checked (see `written_tables`). Only
+random numbers, which are drawn here, can still be out of range.
 """
 
 import math
+import os
+from pathlib import Path
 from typing import NamedTuple
 
 from ..core import ArmLinks
 from ..errors import ScenarioError
 from ..fields import Frozen, TomlTable
+from ..own_code import parse_classes
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm
-from .control_tables import complete_control
 from .distributions import Draws, has_distribution
 from .key_checks import (
     VectorCounts,
+    check_choice,
     expand_vectors,
     field_names,
     find_count_problem,
@@ -28,22 +31,25 @@ from .link_inertia import LinkInertia
 from .link_tables import complete_link
 from .named_files import NamedFiles
 from .operators import ENVIRONMENTS, OPERATORS, HeldArm, resolve_operators
-from .own_plant import resolve_plant
+from .own_law import complete_own_law
+from .own_plant import OwnPlant
 from .refusals import convert_drawn
 from .site_spec import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, Limits, SiteSpec
+from .written_tables import check_control
 
 _MIN_DOWN_LENGTH = 1e-6
-"""Smallest sum of the absolute components of a vector that still counts as a direction."""
+"""Smallest sum of absolute components for which a vector is accepted as a direction."""
+_DEFAULT_LAW = "adaptive"
 _BELONGS_TO_CHAIN = "belongs to an arm with a urdf, but this arm is planar"
 
 
 class _SharedByAll(NamedTuple):
-    """Tables and files that concern all arms, for completing the table of each arm.
+    """Tables and files shared by all sites, used to complete the table of each site.
 
     Attributes:
-        rate_hz: Tick rate of the sites that state no other, in Hz.
-        control: Table `control` for all sites, as its author wrote it.
-        draws: Draws the numbers that are given as distributions.
+        rate_hz: Default tick rate, in Hz.
+        control: Table `control` for all sites, as written by its author.
+        draws: Draws the numbers that are specified as distributions.
         files: Files that the sites name.
         chains: True if the arms are modelled as general chains of joints.
     """
@@ -58,14 +64,15 @@ class _SharedByAll(NamedTuple):
 def complete_site_tables(
     tables: TomlTable, rate_hz: int, draws: Draws, files: NamedFiles
 ) -> TomlTable:
-    """Returns the table of every arm of a scenario with all its keys, by name.
+    """Returns a mapping from site name to the complete table of the site.
 
-    Keys that the author left out get their values for all arms, or their defaults.
+    Keys that the author left out are taken from the tables for all sites, or set to their
+    defaults.
 
     Args:
         tables: Tables of the scenario file.
-        rate_hz: Tick rate of the sites that state no other, in Hz.
-        draws: Draws the numbers that are given as distributions.
+        rate_hz: Default tick rate, in Hz.
+        draws: Draws the numbers that are specified as distributions.
         files: Files that the sites name.
 
     Raises:
@@ -73,7 +80,7 @@ def complete_site_tables(
     """
     control = tables.get("control", {})
     # A mistake in the table for all sites is refused there, and not at the first site.
-    complete_control(control, {}, "control", VectorCounts())
+    _complete_control(control, {}, "control", VectorCounts())
     sites = {name: _join_groups(site, tables) for name, site in tables["sites"].items()}
 
     # The kernel computes planar arms with their own formulas, and all other arms as chains. If
@@ -89,17 +96,67 @@ def complete_site_tables(
     return {name: _complete_site(site, name, shared) for name, site in sites.items()}
 
 
-def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
-    """Returns the table of a site, completed with the keys that all sites share.
+def _complete_control(
+    written: TomlTable, common: TomlTable, path: str, counts: VectorCounts
+) -> TomlTable:
+    """Completes a control law table, so that every gain has a value.
 
-    The groups of keys in `SITE_GROUPS`, such as `arm` and `limits`, may be written once for all
-    sites, and again for a single site. The keys of the single site have priority.
-
-    The table `arm.links` contains a table for each link of a robot. These are joined link by
-    link and key by key, so that a site may change a single inertia.
+    Missing gains are set to their defaults, and a scalar is expanded to a vector with one entry
+    per joint.
 
     Args:
-        written: Table of the site as its author wrote it.
+        written: Table `control` of a site as written by its author.
+        common: Table `control` for all sites. Its gains replace missing gains only if it names
+            the same law, since other laws have other gains.
+        path: Path of the table, for error messages.
+        counts: Vector lengths to which scalars are expanded.
+
+    Raises:
+        ScenarioError: There is no such law, or it has no such gain.
+    """
+    common_law = common.get("law", _DEFAULT_LAW)
+    law = str(written.get("law", common_law))
+    if ":" in law:
+        return complete_own_law(law, written, common, path)
+    if law not in LAWS:
+        raise _refuse_law(law, f"{path}.law")
+    check_control(written, law, path)
+    inherited = common if common_law == law else {}
+    return expand_vectors({**inherited, **written, "law": law}, LAWS[law], counts)
+
+
+def _refuse_law(law: str, path: str) -> ScenarioError:
+    """Returns the error for a control law that does not exist.
+
+    If there is a Python file of that name, the message contains the correct name of its class.
+
+    Args:
+        law: The name.
+        path: Path of the key, for error messages.
+    """
+    file = Path(law if law.endswith(".py") else f"{law}.py")
+    if os.path.isfile(file):  # noqa: PTH113 - Path.is_file raises for a very long name
+        classes = parse_classes(file.read_bytes(), file, path)
+        names = [f"{file.stem}:{name}" for name in classes]
+        remedy = f"write {' or '.join(names)}" if names else "it defines no class"
+        return ScenarioError(f"is {law!r}, but a law in a file is a class: {remedy}", path=path)
+    # "own" is the type of users' laws in canonical texts.
+    built_in = [name for name in LAWS if name != "own"]
+    check_choice(law, [*built_in, "module:Class"], path)
+    return ScenarioError(f"is {law!r}, but must name a class as module:Class", path=path)
+
+
+def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
+    """Merges the table of a site with the keys shared by all sites.
+
+    The groups of keys in `SITE_GROUPS`, such as `arm` and `limits`, may be set for all sites
+    and overridden for individual ones.
+
+    The table `arm.links` contains one table per robot link. These are merged link by link and
+    key by key, so a site may change a single inertia.
+
+    Args:
+        written: Table of the site as written by its author.
         tables: Tables of the scenario file.
     """
     site = dict(written)
@@ -121,16 +178,16 @@ def _join_groups(written: TomlTable, tables: TomlTable) -> TomlTable:
 
 
 def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTable:
-    """Returns the table of one arm with all its keys.
+    """Returns the complete table of one site.
 
-    The model of the arm comes first, because it states the number of joints, and thereby the
-    lengths of all vectors. The order in which random numbers are drawn decides the order of the
-    table `drawn`, and thereby the hash of the scenario, so it must not change.
+    The arm model is built first, since its number of joints determines the lengths of all
+    vectors. The order in which random numbers are drawn must not change: it determines the
+    order of the table `drawn`, and with it the hash of the scenario.
 
     Args:
-        site: Table of the site, joined with the tables for all sites.
+        site: Table of the site, merged with the tables for all sites.
         name: Name of the site.
-        shared: What all sites share.
+        shared: Tables and files shared by all sites.
 
     Raises:
         ScenarioError: A table is not valid.
@@ -140,14 +197,14 @@ def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTabl
     counts = model.counts
     site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
     site["arm"] = arm
-    site["control"] = complete_control(
+    site["control"] = _complete_control(
         site.get("control", {}), shared.control, f"{path}.control", counts
     )
     site["limits"] = {**_list_default_limits(site, model), **site["limits"]}
     site.setdefault("role", "master")
     site.setdefault("rate_hz", shared.rate_hz)
     if "plant" in site:
-        site["plant"] = resolve_plant(site["plant"], f"{path}.plant")
+        site["plant"] = OwnPlant.complete_table(site["plant"], f"{path}.plant")
     if "view" in site:
         site["view"] = complete_link(site["view"], {}, name, shared.files, f"{path}.view")
 
@@ -165,15 +222,15 @@ def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTabl
 def _complete_arm(
     site: TomlTable, shared: _SharedByAll, path: str
 ) -> tuple[ArmModel, TomlTable]:
-    """Returns the model of an arm, and the complete table of the arm.
+    """Returns the model of an arm and its complete table.
 
-    The key `armature_kg_m2` (rotor inertias) may contain one number for all joints, and only
-    the model knows the number of joints. Therefore the model is built without this key first,
-    and again with the key.
+    The key `armature_kg_m2` (rotor inertias) may contain one number for all joints, but the
+    number of joints is known only from the model. The model is therefore first built without
+    this key, and then again with it.
 
     Args:
         site: Table of the site.
-        shared: What all sites share.
+        shared: Tables and files shared by all sites.
         path: Path of the arm's table, for error messages.
 
     Raises:
@@ -212,13 +269,13 @@ def _complete_arm(
 def _model_arm(
     table: TomlTable, task_table: TomlTable, shared: _SharedByAll, path: str
 ) -> ArmModel:
-    """Builds the model of an arm from its table, to know its joints and dynamics.
+    """Builds the model of an arm from its table, to determine its joints and dynamics.
 
     Args:
         table: Table of the arm.
-        task_table: Table `task` of the site: the coordinates that the sites share. Its random
-            numbers are not drawn yet. The lengths of the vectors do not depend on them.
-        shared: What all sites share.
+        task_table: Table `task` of the site, with the shared coordinates. Its random numbers
+            have not been drawn yet, but do not affect vector lengths.
+        shared: Tables and files shared by all sites.
         path: Path of the arm's table, for error messages.
 
     Raises:
@@ -246,14 +303,14 @@ def _model_arm(
 
 
 def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None:
-    """Refuses keys of an arm that have no effect on its kind, and gravity without a direction.
+    """Raises ScenarioError for arm keys that have no effect, or gravity with no direction.
 
-    The kinds are the planar arm of two links, and a chain of joints from a URDF file.
+    Some keys apply only to the planar two-link arm, others only to a chain from a URDF file.
 
     Args:
         arm: The arm.
-        table: Table from which the arm was built. The table shows which keys the author wrote.
-        chains: True if the arms of the scenario are general chains of joints.
+        table: Table from which the arm was built, which shows the keys set by the author.
+        chains: True if the arms of the scenario are modelled as chains.
         path: Path of the table, for error messages.
     """
     foreign_keys = ArmLinks._fields if arm.urdf else CHAIN_KEYS
@@ -275,11 +332,11 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
 
 
 def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
-    """Returns the limits of an arm that apply if its author states none.
+    """Returns the default limits of an arm.
 
-    The efforts and speeds of a chain's joints come from its URDF file. A joint without a
-    positive finite limit in the file has the default of `Limits`. A simulated arm that comes to
-    rest while others are silent (rule "glide") also has a limit on the torque's rate of change.
+    The effort and velocity limits of a chain are taken from its URDF file. A joint with no
+    positive finite limit in the file has the default of `Limits`. A simulated arm with the
+    stale rule "glide" also has a limit on the torque's rate of change.
     """
     limits: TomlTable = {}
     if site["on_stale"].get("action") == "glide" and site.get("plant") != "external":
@@ -295,10 +352,10 @@ def _list_default_limits(site: TomlTable, model: ArmModel) -> TomlTable:
 
 
 def _draw_numbers(site: TomlTable, draws: Draws, path: str) -> None:
-    """Replaces random distributions in the table of one arm by drawn numbers, in place.
+    """Replaces the random distributions in a site table with drawn numbers, in place.
 
-    These are the start pose, the limits, the rules for silent arms, the task and the gains of
-    the control law. The numbers of the arm's model have been drawn before.
+    Covers the start pose, the limits, the stale rule, the task and the gains of the control
+    law. The numbers of the arm have already been drawn.
     """
     start = {key: site[key] for key in ("q0_rad", "qd0_rad_s")}
     site |= draws.draw_numbers(start, path)
@@ -311,7 +368,7 @@ def _draw_numbers(site: TomlTable, draws: Draws, path: str) -> None:
 
 
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
-    """Refuses vectors of an arm, such as gains per joint, with a wrong count of numbers.
+    """Raises ScenarioError if a vector, such as gains per joint, has the wrong length.
 
     Args:
         site: Complete table of the site.

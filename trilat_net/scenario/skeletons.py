@@ -1,12 +1,12 @@
-"""Writes files from which users start their own control law, operator or plant.
+"""Writes skeleton files for users' own control laws, operators and plants.
 
-`new_law`, `new_hand` and `new_plant` write a class with a simple content, and a test of it. The
-user then edits code that works instead of starting from an empty file.
+`new_law`, `new_hand` and `new_plant` each write a minimal class and a test for it, so users can
+start from working code.
 
 Invariant:
     - The skeletons are files of this package, such as `scenarios/_law.txt`. The name of the
       class is derived from the file name: mylaw.py contains the class MyLaw.
-    - The written code runs unchanged, and its test passes.
+    - The generated code runs unchanged, and its test passes.
 """
 
 import keyword
@@ -20,31 +20,31 @@ from .named_files import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a template of a control law, and a test of the law.
+    """Writes a template for a control law, and a test for it.
 
-    The corresponding command is `trilat new law`.
+    Equivalent to the command `trilat new law`.
 
     >>> [path.name for path in tn.new_law("mylaw.py")]
     ['mylaw.py', 'test_mylaw.py']
 
     Args:
-        path: File to write, which is a Python module. mylaw.py contains the class MyLaw.
-        force: If True, existing files with these names are replaced.
+        path: Python module to write. For example, mylaw.py will contain the class MyLaw.
+        force: If True, existing files are overwritten.
 
     Returns:
-        The written files.
+        Paths of the files written.
 
     Raises:
-        UsageError: A file exists, or Python has another module of that name.
+        UsageError: A file already exists, or Python has another module of that name.
     """
     return _write_skeleton("law", Path(path), force=force)
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a template of an operator, and a test of the operator.
+    """Writes a template for an operator, and a test for it.
 
-    An operator is a program that moves an arm in place of a person. The corresponding command
-    is `trilat new hand`. The arguments are those of `new_law`.
+    The operator is a program that moves an arm in place of a person. Equivalent to the command
+    `trilat new hand`. See `new_law` for the arguments.
 
     >>> [path.name for path in tn.new_hand("myhand.py")]
     ['myhand.py', 'test_myhand.py']
@@ -53,10 +53,10 @@ def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes a template of a plant, and a test of the plant.
+    """Writes a template for a plant, and a test for it.
 
-    A plant is a program that computes the motion of an arm. The corresponding command is
-    `trilat new plant`. The arguments are those of `new_law`.
+    The plant is a program that computes the motion of an arm. Equivalent to the command `trilat
+    new plant`. See `new_law` for the arguments.
 
     >>> [path.name for path in tn.new_plant("myplant.py")]
     ['myplant.py', 'test_myplant.py']
@@ -65,16 +65,16 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
-    """Writes a Python file with a template of a class, and a file with its test.
+    """Writes a Python file with a template for a class, and a file with its test.
 
     Args:
         kind: "law", "hand" or "plant".
-        file: File of the skeleton.
-        force: If True, existing files are replaced.
+        file: Path of the skeleton.
+        force: If True, existing files are overwritten.
 
     Raises:
-        UsageError: A file exists, its name is not that of a module, or Python has another
-            module of that name.
+        UsageError: A file already exists, its name is not a valid module name, or Python has
+            another module of that name.
     """
     module = file.stem
     is_module_name = module.isidentifier() and not keyword.iskeyword(module)
@@ -100,7 +100,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
 
 
 def _is_other_module(module: str, file: Path) -> bool:
-    """Returns True if Python would find another file under the name of a new module."""
+    """Returns True if the name of a new module is already taken by another Python module."""
     spec = find_spec(module)
     if spec is None:
         return False
@@ -110,14 +110,13 @@ def _is_other_module(module: str, file: Path) -> bool:
 
 
 def name_skeleton_class(module: str, kind: str) -> str:
-    """Returns the name of the class in a new file that a user completes.
+    """Derives the name of the class in a skeleton file from the module name.
 
-    For example, the modules mylaw and my_law contain the class MyLaw, and spring contains
-    Spring.
+    For example, mylaw and my_law contain the class MyLaw, and spring contains Spring.
 
     Args:
         module: Name of the Python module that contains the skeleton.
-        kind: Kind of the class: "law" (a control law), "hand" (an operator) or "plant".
+        kind: "law" for a control law, "hand" for an operator, or "plant".
     """
     parts = re.sub(rf"(?<=[a-z0-9]){kind}$", f"_{kind}", module).split("_")
     return "".join(part[:1].upper() + part[1:] for part in parts) or kind.title()

@@ -1,7 +1,7 @@
-"""Lists the keys of other tables that the author of a scenario may have meant by a wrong key.
+"""Lists keys of other tables that the author of a scenario may have meant by a wrong key.
 
-A scenario is a TOML file that describes an experiment. A user who writes only the last part of
-the path of a key, such as "delay_ms", learns the whole path from the error.
+If a user writes only the last part of a key path, such as "delay_ms", the error message
+suggests the full path.
 """
 
 from functools import cache
@@ -14,18 +14,18 @@ from .site_spec import SITE_GROUPS
 
 @cache
 def list_link_paths() -> tuple[str, ...]:
-    """Returns the dotted paths of the keys that apply to all network links, as in "link.loss".
+    """Returns the dotted paths of the keys that apply to all links, such as "link.loss".
 
-    Messages about a misspelt key suggest them.
+    Used for suggestions in messages about misspelt keys.
     """
     keys = {key for model in DELAY_MODELS.values() for key in field_names(model)}
     return tuple(f"link.{key}" for key in ("model", "preset", *sorted(keys)))
 
 
 def list_group_paths() -> list[str]:
-    """Returns the dotted paths of the keys that apply to all arms or to all network links.
+    """Returns the dotted paths of the keys that apply to all arms or to all links.
 
-    Messages about a misspelt key suggest them.
+    Used for suggestions in messages about misspelt keys.
     """
     gains = {key for law in LAWS.values() for key in field_names(law)}
     paths = [*list_link_paths(), *(f"control.{key}" for key in ("law", *sorted(gains)))]

@@ -1,23 +1,22 @@
-"""Reads arms from URDF files: joints between a base and an end link, and the moved bodies.
+"""Reads arms from URDF files: the joints between a base and an end link, and the moved bodies.
 
-URDF is an XML format for robots. A robot is a tree of links (bodies) and joints; an arm is the
-path from one link, the base, to another link, the tip. Links that are fixed to a link of the
-arm, and branches such as fingers, become part of its body. The units are kg, m, rad, N m, and N
-along a prismatic joint, as in URDF. Each link has the coordinate frame of the joint that moves
-it.
+A robot is a tree of links (bodies) and joints; an arm is the path from one link, the base, to
+another, the tip. Links fixed to a link of the arm, and branches such as fingers, become part of
+the body of that link. Units are those of URDF: kg, m, rad, N m, and N along a prismatic joint.
+Each link uses the coordinate frame of the joint that moves it.
 
 Invariant:
     - An arm is physically possible: every moving body has mass, and its principal moments of
       inertia are positive and satisfy the triangle inequality.
-    - Everything that is attached to a moving link is part of its body. A link that does not
-      lead to the tip never makes an arm unusable. If its inertia is impossible, a note says how
-      the link was treated.
-    - If a link on the way to the tip has an impossible inertia, the arm is refused and the link
-      is named, unless the caller permits the balancing of inertias or states another inertia
-      for the link.
-    - The text is not trusted: no file that it names is opened, and no entity is expanded.
-    - The numbers of an arm have the same bits on every machine. Therefore
-      `core.elementary.sincos` computes sines and cosines, and sums have a fixed order.
+    - Everything attached to a moving link is part of its body. A link that does not lead to the
+      tip never makes an arm unusable. If its inertia is impossible, a note says how the link
+      was treated.
+    - If a link on the way to the tip has an impossible inertia, the arm is rejected and the
+      error names the link, unless the caller allows inertias to be balanced or supplies another
+      inertia for the link.
+    - The file content is not trusted: no file named in it is opened, and no entity is expanded.
+    - The numbers of an arm have the same bits on every machine. Sines and cosines are therefore
+      computed with `core.elementary.sincos`, and sums have a fixed order.
 """
 
 import math
@@ -36,34 +35,34 @@ from ..records import MAX_JOINTS
 from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 
 MAX_CHARACTERS = 1_000_000
-"""Largest length of a file, in characters."""
+"""Maximum length of a file, in characters."""
 MAX_NUMBER_LENGTH = 100
-"""Largest length of the text of a number. If the text is not a number, the time that the
-regular expression takes grows with the square of the length.
+"""Maximum number of characters in a number. If the text is not a number, the time taken by the
+regular expression grows quadratically with the length.
 """
 MAX_OFFSET_M = 100.0
-"""Largest coordinate of an origin, in m. A file with larger ones is wrong, or in millimetres.
-"""
+"""Largest coordinate of an origin, in m. Larger ones indicate an error, or millimetres."""
 CONSISTENCY = 1e-9
-"""Fraction of the largest principal moment by which rounding may violate the inequalities."""
+"""Permitted violation of the inertia inequalities relative to the largest moment."""
 LEAST_MASS_KG = 1e-9
-"""Smallest mass of a body that moves, in kg."""
+"""Smallest mass of a moving body, in kg."""
 LEAST_MOMENT_KG_M2 = 1e-12
-"""Smallest principal moment of inertia of a body that moves, in kg m^2.
+"""Smallest principal moment of inertia of a moving body, in kg m^2.
 
 The moments of a single link may violate the inequalities by less than this.
 """
 _MIN_AXIS_LENGTH = 1e-6
-"""Smallest length of the vector of an axis."""
+"""Smallest length of an axis vector."""
 _MAX_LISTED_NAMES = 8
-"""Largest number of names in an error message."""
+"""Maximum number of names in an error message."""
 _MAX_QUOTED_LENGTH = 60
-"""Largest length of a text of the file in an error message."""
+"""Maximum length of a quotation from the file in an error message."""
 
 BodyParameters = tuple[float, ...]
-"""Ten inertial parameters m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of a body.
+"""Inertial parameters m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz of a body.
 
-m is the mass and c the centre of mass. The inertia is about the origin of a frame, in its axes.
+m is the mass and c is the centre of mass. The inertia is about the origin of a frame, along its
+axes.
 """
 
 _ORIGIN: Three = (0.0, 0.0, 0.0)
@@ -73,13 +72,13 @@ _KINDS = (*_MOVING_KINDS, "fixed", "floating", "planar")
 
 
 class UrdfPayload(NamedTuple):
-    """Body that is fixed to the tip of an arm, such as a tool that the URDF file lacks.
+    """Body fixed to the tip of an arm, such as a tool that is not in the URDF file.
 
     Attributes:
         mass_kg: Mass, in kg.
-        com_m: Centre of mass in the frame of the tip, in m.
-        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, in the axes of the
-            tip, in kg m^2.
+        com_m: Centre of mass in the tip frame, in m.
+        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass, along the axes of
+            the tip frame, in kg m^2.
     """
 
     mass_kg: float
@@ -88,24 +87,22 @@ class UrdfPayload(NamedTuple):
 
 
 class UrdfJoint(NamedTuple):
-    """Moving joint of an arm that was read from a URDF file, with the body that it moves.
-
-    The body includes everything that is fixed to it.
+    """Moving joint of an arm in a URDF file, with the body that it moves.
 
     Attributes:
         name: Name of the joint.
-        link: Name of the link that the joint moves.
+        link: Name of the link moved by the joint.
         kind: "revolute" (also for a continuous joint) or "prismatic".
-        axis: Unit vector of the axis in the joint's frame.
-        rotation: Orientation of the joint's frame at q = 0, three rows, in the frame of the
-            previous moving link. For the first joint, in the frame of the base.
-        origin_m: Origin of the joint's frame, in the same frame, in m.
-        inertia: Inertial parameters of the body in the joint's frame, including everything that
-            is fixed to the link.
-        lower: Smallest position, in rad or m. -inf if the file states no limit.
-        upper: Largest position, in rad or m. inf if the file states no limit.
-        effort_limit: Largest torque or force, in N m or N. inf if the file states no limit.
-        velocity_limit: Largest speed, in rad/s or m/s. inf if the file states no limit.
+        axis: Unit vector of the joint axis in the joint frame.
+        rotation: Orientation of the joint frame at q = 0, as three rows, relative to the frame
+            of the previous moving link (the base frame for the first joint).
+        origin_m: Origin of the joint frame in that same frame, in m.
+        inertia: Inertial parameters of the body in the joint frame, including everything fixed
+            to the link.
+        lower: Smallest position, in rad or m; -inf if the file has no limit.
+        upper: Largest position, in rad or m; inf if the file has no limit.
+        effort_limit: Largest torque or force, in N m or N; inf if the file has no limit.
+        velocity_limit: Largest speed, in rad/s or m/s; inf if the file has no limit.
         viscous: Viscous friction, in N m s/rad or N s/m.
         coulomb: Coulomb friction, in N m or N.
     """
@@ -126,17 +123,16 @@ class UrdfJoint(NamedTuple):
 
 
 class UrdfChain(NamedTuple):
-    """Arm that was read from a URDF file: its moving joints from a base link to a tip link.
-
-    URDF is the usual XML format for the links and joints of a robot.
+    """Arm read from a URDF file: the moving joints from a base link to a tip link.
 
     Attributes:
-        base: Name of the link that does not move.
+        base: Name of the fixed link.
         tip: Name of the link at the end of the arm.
-        joints: 1 to `MAX_JOINTS` joints, starting at the base.
-        tip_rotation: Orientation of the tip in the frame of the last moving link, three rows.
-        tip_origin_m: Origin of the tip in the same frame, in m.
-        notes: Sentences about details that the author of the file may not have intended.
+        joints: 1 to `MAX_JOINTS` joints, from the base to the tip.
+        tip_rotation: Orientation of the tip in the frame of the last moving link, as three
+            rows.
+        tip_origin_m: Origin of the tip in that same frame, in m.
+        notes: Notes on details that the author of the file may not have intended, as sentences.
     """
 
     base: str
@@ -148,15 +144,15 @@ class UrdfChain(NamedTuple):
 
 
 class _Edge(NamedTuple):
-    """Joint of a URDF file, which connects a parent link and a child link.
+    """Joint of a URDF file, which connects a parent link to a child link.
 
-    The links and joints of a robot form a tree. The joints are its edges.
+    The links and joints of a robot form a tree, whose edges are the joints.
 
     Attributes:
         name: Name of the joint.
         kind: Type of the joint in URDF, for example "revolute" or "fixed".
         parent: Name of the link that carries the joint.
-        child: Name of the link that the joint connects to the parent.
+        child: Name of the link attached through the joint.
         element: XML element of the joint.
     """
 
@@ -168,17 +164,17 @@ class _Edge(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """True if the joint can move a link of an arm. A fixed joint cannot."""
+        """True if the joint can move a link of an arm, that is, if it is not a fixed joint."""
         return self.kind in _MOVING_KINDS
 
 
 class _Robot(NamedTuple):
-    """All links and joints of a robot, as the tree that its URDF file describes.
+    """The tree of links and joints described in a URDF file.
 
     Attributes:
-        links: XML elements of the links, by name.
-        above: For each link except the root, its parent joint.
-        below: For each link, its child joints.
+        links: Mapping from link name to XML element.
+        above: Mapping from each link except the root to its parent joint.
+        below: Mapping from each link to its child joints.
     """
 
     links: Mapping[str, Element]
@@ -187,12 +183,12 @@ class _Robot(NamedTuple):
 
 
 class _Inertias(NamedTuple):
-    """Changes that a scenario makes to the masses and inertias in a URDF file.
+    """Changes made by a scenario to the masses and inertias in a URDF file.
 
     Attributes:
-        links: Masses and inertias that replace those in the file, by the name of the link.
-        balance: If True, an impossible inertia is replaced by the nearest possible one. If
-            False, it is refused or noted.
+        links: Mapping from link name to the mass and inertia that override those in the file.
+        balance: If True, an impossible inertia is replaced with the nearest possible one. If
+            False, it is rejected or noted.
     """
 
     links: Mapping[str, LinkInertia]
@@ -200,15 +196,15 @@ class _Inertias(NamedTuple):
 
 
 class _LinkBody(NamedTuple):
-    """Mass and inertia of one link of a robot, in the frame of the moving link that carries it.
+    """Mass and inertia of one link, in the frame of the moving link that carries it.
 
-    A link on a fixed joint moves together with the link before it.
+    A link on a fixed joint moves together with its parent link.
 
     Attributes:
         link: Name of the link.
-        body: Inertial parameters as the file states them, or balanced.
-        point: If the stated moments are impossible, the inertial parameters of a point with the
-            same mass. Otherwise None.
+        body: Inertial parameters from the file, possibly balanced.
+        point: If the moments in the file are impossible, the inertial parameters of a point of
+            the same mass; otherwise None.
         problem: Reason why the moments are impossible. Empty if they are possible.
     """
 
@@ -227,20 +223,18 @@ def read_urdf(
     *,
     balance: bool = False,
 ) -> UrdfChain:
-    """Reads the arm between two links of a robot from a URDF file.
+    """Parses the arm between two links of a robot from a URDF file.
 
-    URDF is the usual XML format for the links and joints of a robot. A link on a fixed joint is
-    part of the moving link that carries it. The same holds for a branch with joints of its own,
-    such as fingers: these joints are held at zero, and a note says so.
+    A link on a fixed joint becomes part of the moving link that carries it. So does a branch
+    with joints of its own, such as fingers: these joints are held at zero, and a note says so.
 
     Args:
-        text: Text of the URDF file.
-        base: Name of the link that does not move. By default, the root of the robot.
-        tip: Name of the link at the end of the arm. By default, the only moving link that
-            carries no other link.
-        payload: Body, such as a tool, that is fixed to the tip. None if there is none.
-        links: Masses and inertias that replace those in the file, by the name of the link.
-        balance: If True, an impossible inertia is replaced by the nearest possible one.
+        text: Content of the URDF file.
+        base: Name of the fixed link. By default, the root of the robot.
+        tip: Name of the link at the end of the arm. By default, the only moving leaf link.
+        payload: Body fixed to the tip, such as a tool.
+        links: Mapping from link name to the mass and inertia that override those in the file.
+        balance: If True, an impossible inertia is replaced with the nearest possible one.
 
     Raises:
         ScenarioError: The file cannot be used. The error names the line, link or joint. If a
@@ -291,9 +285,10 @@ def read_urdf(
 def _check_supplied_inertias(
     robot: _Robot, links: Mapping[str, LinkInertia], moved_links: Collection[str]
 ) -> None:
-    """Refuses inertias in a scenario for links that do not exist or that the arm cannot move.
+    """Raises ScenarioError if a scenario gives inertias of links that the arm cannot move.
 
-    They would have no effect, probably because a name is misspelt.
+    Such inertias, or inertias of links that do not exist, would have no effect and are probably
+    due to a misspelt name.
     """
     for name in links:
         if name not in robot.links:
@@ -308,39 +303,39 @@ def _check_supplied_inertias(
 
 
 def _key(link: str) -> str:
-    """Returns the path of a link's inertia in a scenario, quoted where TOML requires it."""
+    """Returns the key of a link's inertia in a scenario, quoted if TOML requires it."""
     return f"links.{link}" if re.fullmatch(r"[A-Za-z0-9_-]+", link) else f'links."{link}"'
 
 
 def _refuse(subject: str, problem: str) -> NoReturn:
-    """Raises the error that a URDF file cannot be used, with the wrong part and the problem.
+    """Raises ScenarioError for an unusable URDF file, naming the wrong part and the problem.
 
     Args:
-        subject: Link, joint or line that is wrong. Empty if the file as a whole is wrong.
+        subject: Link, joint or line that is wrong. Empty for the file as a whole.
         problem: Rest of the sentence.
     """
     raise ScenarioError(f"{subject}: {problem}" if subject else problem)
 
 
 def _quote(text: str) -> str:
-    """Returns a text in quotation marks, shortened if it is long."""
+    """Returns a string in quotation marks, shortened if it is long."""
     if len(text) > _MAX_QUOTED_LENGTH:
         text = f"{text[: _MAX_QUOTED_LENGTH - 3]}..."
     return repr(text)
 
 
 def _link(name: str) -> str:
-    """Returns the name of a link as error messages write it."""
+    """Formats the name of a link for error messages."""
     return f"link {_quote(name)}"
 
 
 def _joint(name: str) -> str:
-    """Returns the name of a joint as error messages write it."""
+    """Formats the name of a joint for error messages."""
     return f"joint {_quote(name)}"
 
 
 def _list_names(names: Sequence[str]) -> str:
-    """Returns a short text with the first names of a list, and the number of further names."""
+    """Returns the first names of a list, and how many more there are, as a short string."""
     text = ", ".join(map(_quote, names[:_MAX_LISTED_NAMES]))
     more = len(names) - _MAX_LISTED_NAMES
     return f"{text} and {more} more" if more > 0 else text
@@ -350,9 +345,9 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def _parse_xml(text: str) -> Element:
-    """Parses the XML text of a URDF file, which may come from an untrusted source.
+    """Parses the XML of a URDF file, which may come from an untrusted source.
 
-    Constructs by which a short text could fill the memory are refused.
+    Constructs that allow a short text to fill the memory are rejected.
 
     Args:
         text: The document.
@@ -399,13 +394,13 @@ def _parse_xml(text: str) -> Element:
 
 
 def _is_xacro(element: Element) -> bool:
-    """True if an element belongs to xacro, a macro language whose output is URDF."""
+    """Returns True if an element belongs to xacro, a macro language that generates URDF."""
     namespace = element.tag.partition("}")[0]
     return "xacro" in namespace or any("${" in value for value in element.attrib.values())
 
 
 def _name_elements(root: Element, tag: str) -> dict[str, Element]:
-    """Returns the XML elements with a certain tag, such as all joints of a robot, by name.
+    """Returns a mapping from name to XML element for all elements with a given tag.
 
     Raises:
         ScenarioError: An element has no name, or two have the same name.
@@ -425,7 +420,7 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
 
 
 def _read_tree(root: Element) -> _Robot:
-    """Reads the tree of links and joints of a robot from the root element of a URDF file.
+    """Parses the tree of links and joints from the root element of a URDF file.
 
     Args:
         root: Root element of the document.
@@ -465,12 +460,12 @@ def _read_tree(root: Element) -> _Robot:
 
 
 def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Edge:
-    """Reads one joint of a URDF file: its type, and the two links that it connects.
+    """Parses one joint of a URDF file: its type, and the two links that it connects.
 
     Args:
         name: Name of the joint.
         element: XML element of the joint.
-        links: Elements of all links, by name.
+        links: Mapping from link name to XML element.
     """
     subject = _joint(name)
     kind = element.get("type", "")
@@ -495,12 +490,10 @@ def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Ed
 
 
 def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
-    """Yields a link of a robot and all of its descendants in the tree of links.
-
-    The order is depth first.
+    """Yields a link of a robot and all of its descendants, depth first.
 
     Yields:
-        The name of a link, and whether any joint between `root` and the link can move.
+        Name of a link, and whether any joint between `root` and the link can move.
     """
     waiting = [(root, False)]
     while waiting:
@@ -516,12 +509,12 @@ def _walk(robot: _Robot, root: str) -> Iterator[tuple[str, bool]]:
 
 
 def _check_end(robot: _Robot, end: str, link: str) -> str:
-    """Checks that the link that was chosen as the base or the tip of an arm exists.
+    """Raises ScenarioError if the link chosen as the base or tip of an arm does not exist.
 
     Args:
         robot: The robot.
         end: "base" or "tip", for error messages.
-        link: Name of the link. Empty if the caller chose none.
+        link: Name of the link. Empty if none was chosen.
 
     Raises:
         ScenarioError: The robot has no such link.
@@ -532,7 +525,7 @@ def _check_end(robot: _Robot, end: str, link: str) -> str:
 
 
 def _find_base(robot: _Robot) -> str:
-    """Returns the only link of a robot that has no parent joint: the base of its tree.
+    """Returns the base of a robot: the only link that has no parent joint.
 
     Raises:
         ScenarioError: There are several such links.
@@ -548,9 +541,7 @@ def _find_base(robot: _Robot) -> str:
 
 
 def _find_tip(robot: _Robot, base: str) -> str:
-    """Returns the only link at the end of a robot's tree, as the tip of the arm.
-
-    It moves with respect to the base, and carries no other link.
+    """Returns the tip of an arm: the only leaf link that moves relative to the base.
 
     Raises:
         ScenarioError: There is no such link, or there are several.
@@ -570,16 +561,16 @@ def _find_tip(robot: _Robot, base: str) -> str:
 
 
 def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
-    """Returns the joints on the way from the base of an arm to its tip, in this order.
+    """Returns the joints on the path from the base of an arm to its tip, in order.
 
     Args:
         robot: Tree of links and joints.
-        base: Name of the link that does not move.
+        base: Name of the fixed link.
         tip: Name of the link at the end of the arm.
 
     Raises:
-        ScenarioError: The tip is not below the base, a joint is of a type that an arm cannot
-            have, or there are too few or too many moving joints.
+        ScenarioError: The tip is not below the base, a joint has a type that is not allowed in
+            an arm, or there are too few or too many moving joints.
     """
     path: list[_Edge] = []
     name = tip
@@ -629,11 +620,10 @@ def _walk_carried(
         robot: The robot.
         moving: The joint.
         path: Joints of the arm.
-        notes: Receives a sentence about each joint that is held at zero.
+        notes: List to which a sentence about each joint held at zero is appended.
 
     Yields:
-        The name of a link, and its frame expressed in the frame of the link that the joint
-        moves.
+        Name of a link, and its frame relative to the link moved by the joint.
     """
     on_path = {edge.name for edge in path}
     waiting = [(moving.child, FramePose())]
@@ -660,15 +650,15 @@ def _read_bodies(
 ) -> Iterator[_LinkBody]:
     """Yields the inertias of links, in the frame of the moving link that carries them.
 
-    A link without mass yields nothing. An impossible mass of a link on the way to the tip is
-    refused; other links with an impossible mass are left out with a note.
+    Massless links are skipped. A link on the path to the tip with an impossible mass raises
+    ScenarioError; other links with an impossible mass are omitted with a note.
 
     Args:
         robot: The robot.
-        carried: Names of the links, and their frames expressed in the frame of the moving link.
+        carried: Names of the links, and their frames relative to the moving link.
         path: Joints of the arm.
-        inertias: Changes that the scenario makes.
-        notes: Receives a sentence about each doubtful link.
+        inertias: Changes made by the scenario.
+        notes: List to which a sentence about each doubtful link is appended.
     """
     leading_links = {edge.child for edge in path}
     for name, pose in carried:
@@ -713,22 +703,22 @@ def _read_body(
     inertias: _Inertias,
     notes: list[str],
 ) -> _LinkBody:
-    """Reads the mass and inertia of a link from a URDF file.
+    """Returns the mass and inertia of a link, balancing impossible inertias if permitted.
 
-    If no real body can have this inertia, the nearest possible one replaces it, provided that
-    the scenario permits it.
+    If the inertia is physically impossible and the scenario permits balancing, it is replaced
+    with the nearest possible one.
 
     Args:
         name: Name of the link.
-        pose: Frame of the link, expressed in the frame of the moving link that carries it.
-        inertial: Inertia in the frame of the link.
+        pose: Frame of the link, relative to the moving link that carries it.
+        inertial: Inertia in the link frame.
         path: Joints of the arm.
-        inertias: Changes that the scenario makes.
-        notes: Receives a sentence if the inertia is balanced.
+        inertias: Changes made by the scenario.
+        notes: List to which a sentence is appended if the inertia is balanced.
 
     Raises:
-        ScenarioError: The inertia is impossible, and the scenario states it or the link leads
-            to the tip.
+        ScenarioError: The inertia is impossible, and either comes from the scenario or belongs
+            to a link on the path to the tip.
     """
     mass, centre, tensor, _ = inertial
     centre_pose = pose @ centre
@@ -758,14 +748,14 @@ def _read_body(
 
 
 def _advise_key(name: str, key: str) -> str:
-    """Advises the user to state a missing or wrong inertia of a link in the scenario."""
+    """Returns advice to specify a missing or wrong link inertia in the scenario."""
     return f"give {key} in [arm.{_key(name)}]"
 
 
 def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
-    """Returns the possible remedies for an impossible inertia on the way to the tip.
+    """Returns remedies for an impossible inertia on the path to the tip.
 
-    The last link can also be cut off by ending the arm at the link before it.
+    The last link can also be cut off by ending the arm at the previous link.
     """
     remedies = ["set arm.balance_inertia = true", _advise_key(name, "inertia_kg_m2")]
     moving_edges = [edge for edge in path if edge.moves]
@@ -776,7 +766,7 @@ def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
 
 
 def _note_supplied(name: str, supplied: LinkInertia) -> str:
-    """Returns a note for the user that the scenario replaces the mass or inertia of a link."""
+    """Returns a note that the scenario overrides the mass or inertia of a link."""
     if supplied.mass_kg == 0.0:
         return f"{_link(name)}: the scenario leaves its mass out"
     keys = ", ".join(supplied.list_given_keys())
@@ -786,13 +776,13 @@ def _note_supplied(name: str, supplied: LinkInertia) -> str:
 def _read_joint(
     edge: _Edge, pose: FramePose, inertia: BodyParameters, notes: list[str]
 ) -> UrdfJoint:
-    """Reads a moving joint of the arm from a URDF file: axis, range, friction and moved body.
+    """Parses a moving joint of the arm: axis, range, friction and moved body.
 
     Args:
         edge: Joint of the file.
-        pose: Frame of the joint, expressed in the frame of the previous moving link.
-        inertia: Inertial parameters of the body that the joint moves.
-        notes: Receives a sentence about limits that the file does not state.
+        pose: Frame of the joint, relative to the previous moving link.
+        inertia: Inertial parameters of the body moved by the joint.
+        notes: List to which a sentence about missing limits is appended.
     """
     subject = _joint(edge.name)
     axis = _child(edge.element, "axis", subject)
@@ -823,10 +813,10 @@ def _read_joint(
 
 
 def _read_friction(edge: _Edge, subject: str) -> tuple[float, float]:
-    """Returns the viscous and the Coulomb (dry) friction of a joint, or 0 if not stated.
+    """Returns the viscous and Coulomb (dry) friction of a joint, 0 if missing.
 
     Raises:
-        ScenarioError: A friction is negative.
+        ScenarioError: A friction value is negative.
     """
     dynamics = _child(edge.element, "dynamics", subject)
     friction = [0.0, 0.0]
@@ -843,7 +833,7 @@ def _read_friction(edge: _Edge, subject: str) -> tuple[float, float]:
 
 
 class _JointLimits(NamedTuple):
-    """Limits of a joint in a URDF file: its range, its largest speed and its largest effort.
+    """Limits of a joint in a URDF file: range, velocity limit and effort limit.
 
     Attributes:
         lower: Smallest position, in rad or m.
@@ -859,15 +849,15 @@ class _JointLimits(NamedTuple):
 
 
 def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
-    """Returns the limits of a joint. Limits that the file does not state are infinite.
+    """Returns the limits of a joint, which are infinite if missing from the file.
 
-    A limit of 0 counts as not stated, because programs that export URDF write 0 if they do not
-    know a limit. A limit above `MAX_QUANTITY` counts as infinite.
+    A limit of 0 is treated as missing, since programs that export URDF write 0 for unknown
+    limits. A limit above `MAX_QUANTITY` is treated as infinite.
 
     Args:
         edge: Joint of the file.
-        subject: Name of the joint in error messages.
-        notes: Receives a sentence about limits that are not stated.
+        subject: Name of the joint for error messages.
+        notes: List to which a sentence about missing limits is appended.
 
     Raises:
         ScenarioError: A limit is negative, or the positions contradict each other.
@@ -918,12 +908,10 @@ def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
 
 
 def _child(element: Element, tag: str, subject: str) -> Element | None:
-    """Returns the only XML child element with a certain tag, or None if there is none.
-
-    Several elements with this tag are refused, because only one could be used.
+    """Returns the only XML child element with a given tag, or None if there is none.
 
     Raises:
-        ScenarioError: There are several such elements.
+        ScenarioError: There are several such elements, of which only one could be used.
     """
     children = element.findall(tag)
     if len(children) > 1:
@@ -934,7 +922,7 @@ def _child(element: Element, tag: str, subject: str) -> Element | None:
 def _read_number(
     element: Element, key: str, subject: str, limit: float = MAX_QUANTITY
 ) -> float:
-    """Reads a number from an attribute of an XML element, and refuses one that is out of range.
+    """Parses a number from an attribute of an XML element and checks its range.
 
     Args:
         element: The element.
@@ -953,10 +941,10 @@ def _read_number(
 
 
 def _parse_number(text: str, attribute: str, subject: str, limit: float) -> float:
-    """Converts a text of a URDF file to a number, and refuses NaN, infinity and huge numbers.
+    """Converts a string to a number, and rejects NaN, infinity and huge numbers.
 
     Args:
-        text: The text.
+        text: The string.
         attribute: Element and attribute, for error messages.
         subject: Link or joint, for error messages.
         limit: Largest absolute value.
@@ -976,7 +964,7 @@ def _parse_number(text: str, attribute: str, subject: str, limit: float) -> floa
 def _read_vector(
     element: Element, key: str, subject: str, limit: float = MAX_QUANTITY
 ) -> Three:
-    """Reads three numbers from an attribute of an XML element, see `_read_number`."""
+    """Parses three numbers from an attribute of an XML element (see `_read_number`)."""
     texts = element.get(key, "").split()
     attribute = f"{element.tag} {key}"
     if len(texts) != 3:
@@ -989,9 +977,9 @@ def _read_vector(
 
 
 def _read_origin(parent: Element, subject: str) -> FramePose:
-    """Reads the pose that the XML element <origin> states for a joint or an inertia.
+    """Returns the pose given by the <origin> element of a joint or inertia.
 
-    Without this element, the pose is that of the parent element's frame.
+    If the element is missing, the pose is that of the parent element's frame.
 
     Raises:
         ScenarioError: The element has an unknown attribute, or a number is wrong.
@@ -1017,14 +1005,14 @@ def _read_origin(parent: Element, subject: str) -> FramePose:
 
 
 class _Inertial(NamedTuple):
-    """Mass, centre of mass and inertia tensor of a link, in the frame of the link.
+    """Mass, centre of mass and inertia tensor of a link, in the link frame.
 
     Attributes:
-        mass: Mass, in kg. 0 if it is not stated.
-        centre: Frame with the centre of mass as its origin, and with the axes of the tensor.
-        tensor: Inertia about the centre of mass, in kg m^2. Zero if it is not stated.
-        lacks: Quantity that neither the file nor the scenario states: "mass" or "inertia".
-            Empty if both are stated.
+        mass: Mass, in kg; 0 if missing.
+        centre: Frame whose origin is the centre of mass and whose axes are those of the tensor.
+        tensor: Inertia about the centre of mass, in kg m^2; zero if missing.
+        lacks: Quantity that is missing from both the file and the scenario: "mass" or
+            "inertia". Empty if neither is missing.
     """
 
     mass: float
@@ -1039,16 +1027,15 @@ _POINT_TENSOR = fill_tensor((0.0,) * 6)
 
 
 def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _Inertial | None:
-    """Reads the mass and inertia of a link, or returns None if the link has no mass.
+    """Returns the mass and inertia of a link, or None if the link has no mass.
 
     Args:
         link: XML element of the link.
         name: Name of the link.
-        supplied: Inertia that the scenario states. Its keys replace those of the file. None if
-            the scenario states nothing.
+        supplied: Inertia from the scenario, whose keys override those of the file, or None.
 
     Raises:
-        ScenarioError: The scenario states an inertia without a mass, or a number is wrong.
+        ScenarioError: The scenario gives an inertia but no mass, or a number is wrong.
     """
     supplied = supplied or LinkInertia()
     inertial = _child(link, "inertial", _link(name))
@@ -1092,18 +1079,18 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
 def _read_stated_inertial(
     inertial: Element, name: str, supplied: LinkInertia
 ) -> tuple[float | None, FramePose, Matrix | None]:
-    """Reads the mass, the frame and the inertia tensor from an XML element <inertial>.
+    """Parses the mass, frame and inertia tensor in an <inertial> element.
 
-    Parts that the experiment replaces are not read. Therefore errors in such parts do not
-    matter.
+    Parts that the scenario overrides are not read, so errors in them do not matter.
 
     Args:
         inertial: The element.
         name: Name of the link.
-        supplied: Inertia that the scenario states.
+        supplied: Inertia from the scenario.
 
     Returns:
-        Mass in kg, frame of the centre of mass, and tensor in kg m^2. None for missing parts.
+        Mass in kg, frame of the centre of mass, and tensor in kg m^2; None for a missing mass
+        or tensor.
     """
     subject = _link(name)
     mass = supplied.mass_kg
@@ -1121,7 +1108,7 @@ def _read_stated_inertial(
 
 
 def _find_mass_problem(inertial: _Inertial) -> str:
-    """Returns why no real body can have the mass of a link, or "" if the mass is possible."""
+    """Returns why the mass of a link is physically impossible, or "" if it is possible."""
     if inertial.lacks == "mass":
         return "its <inertial> has no <mass>"
     if inertial.mass < 0.0:
@@ -1134,10 +1121,8 @@ def _find_mass_problem(inertial: _Inertial) -> str:
 def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameters:
     """Returns the mass and inertia of a payload in the frame of the link that carries it.
 
-    The payload, for example a tool, is fixed to the tip of the arm.
-
     Args:
-        payload: The payload, in the frame of the tip.
+        payload: The payload, in the tip frame.
         fixed: Fixed joints from the last moving link to the tip.
 
     Raises:
@@ -1160,15 +1145,15 @@ def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameter
 def _principal_moments(tensor: Matrix) -> list[float]:
     """Returns the eigenvalues of an inertia tensor in ascending order.
 
-    Their last bits may differ between machines, so they are used for checks and notes only.
+    Their last bits may differ between machines, so they are used only for checks and notes.
     """
     return [float(moment) for moment in np.linalg.eigvalsh(np.array(tensor))]
 
 
 def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) -> str:
-    """Returns the reason why three principal moments of inertia are impossible.
+    """Returns why three principal moments of inertia are physically impossible.
 
-    The moments of a body are positive, and none exceeds the sum of the other two.
+    The moments of a body are positive, and none of them exceeds the sum of the other two.
 
     Args:
         moments: Moments in ascending order, in kg m^2.
@@ -1176,7 +1161,7 @@ def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) 
         slack: Permitted violation of the triangle inequality, in kg m^2.
 
     Returns:
-        Part of a sentence. Empty if the moments are possible.
+        The reason as part of a sentence. Empty if the moments are possible.
     """
     smallest, middle, largest = moments
     stated = (
@@ -1191,18 +1176,18 @@ def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) 
 
 
 def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> BodyParameters:
-    """Adds up the masses and inertias of all links that one joint moves together.
+    """Combines the masses and inertias of all links moved by one joint.
 
-    Links on side branches may have impossible moments of inertia. Their stated moments are used
-    if the sum is nevertheless a possible body. Otherwise these links count as point masses.
+    Links on side branches may have impossible moments of inertia. These are used if the
+    combined body is nevertheless possible. Otherwise, such links are treated as point masses.
 
     Args:
         edge: The joint.
-        bodies: Inertias of the links, in the frame of the joint.
-        notes: Receives a sentence about each link with impossible moments.
+        bodies: Inertias of the links, in the joint frame.
+        notes: List to which a sentence about each link with impossible moments is appended.
 
     Raises:
-        ScenarioError: The sum is not a body with mass and extent.
+        ScenarioError: The combined body lacks mass or extent.
     """
     subject = f"{_link(edge.child)}, which {_joint(edge.name)} moves"
     if not bodies:
@@ -1232,7 +1217,7 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> 
 
 
 def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
-    """Returns the mass and inertia of several bodies together, given in the same frame."""
+    """Combines the masses and inertias of several bodies given in the same frame."""
     total = bodies[0]
     # The built-in `sum` rounds differently from Python 3.12 on.
     for body in bodies[1:]:
@@ -1241,7 +1226,7 @@ def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
 
 
 def _find_sum_problem(total: BodyParameters) -> str:
-    """Returns why no real body can have the summed mass and inertia at a joint, or ""."""
+    """Returns why the combined body at a joint is physically impossible, or ""."""
     mass = total[0]
     if mass < LEAST_MASS_KG:
         return (

@@ -1,16 +1,15 @@
-"""Refuses scenarios that cannot work, and converts all others to types.
+"""Validates complete scenarios and converts them to typed objects.
 
-A scenario is the description of an experiment. The types of its tables limit each single key.
-The functions of this module check conditions that involve several keys, for example that a
-joint starts within its stops. `build_scenario` does both.
+The types of the tables restrict individual keys. This module checks conditions that involve
+several keys, for example that a joint starts within its stops. `build_scenario` does both.
 
-`check_outside_arms` is for callers that need more than a valid scenario: a live session with
-real robots.
+`check_outside_arms` performs the additional checks required for a live session with real
+robots.
 
 Invariant:
     - An error contains the path of the key in the scenario file.
     - Some control laws have requirements that not every scenario satisfies, such as a known arm
-      or exactly two sites. If a requirement is not satisfied, the scenario is refused with the
+      or exactly two sites. If a requirement is not satisfied, the scenario is rejected with the
       reason before anything runs.
 """
 
@@ -45,7 +44,7 @@ from .scenario_types import Scenario
 from .site_spec import Limits, SiteSpec
 
 RANK_TOLERANCE = 1e-6
-"""Ratio of a singular value to the largest one below which the direction counts as immobile."""
+"""Singular value, relative to the largest, below which a direction counts as immobile."""
 
 
 OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad")
@@ -56,23 +55,23 @@ _ASSUMED_LIMITS = {
     "tau_limit_nm": ("efforts", "effort", "tau_limit_nm = 60.0"),
     "qd_limit_rad_s": ("speeds", "velocity", "qd_limit_rad_s = 6.0"),
 }
-"""Limits that a scenario always has, because a simulated arm has defaults for them.
+"""Limits that every scenario has, since a simulated arm has defaults for them.
 
-The entry of a key consists of the arm's attribute with the limits of its URDF file, the
-attribute of the element `<limit>` in that file, and an example.
+The entry for each key contains the attribute of the arm with the limits of its URDF file, the
+attribute of the `<limit>` element in that file, and an example.
 """
 
 
 def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
-    """Refuses a limit of a real robot that neither the author nor the URDF file stated.
+    """Raises ScenarioError if a limit of a real robot comes from a default.
 
-    A complete scenario contains the defaults as if its author had written them. A limit counts
-    as assumed if it equals the default. For the planar arm, the default is a single number. For
-    a chain, it occurs in the list of limits at joints for which the URDF file states no limit.
+    A complete scenario does not distinguish defaults from values written by its author, so a
+    limit is treated as assumed if it equals the default. For the planar arm, the default is a
+    single number. For a chain, it appears at those joints for which the URDF file has no limit.
 
     Args:
-        scenario: Description of the experiment.
-        name: Name of the site with the robot.
+        scenario: The scenario.
+        name: Name of the site of the robot.
         key: Key of the limit.
 
     Raises:
@@ -101,14 +100,14 @@ def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses real robots that lack limits, or whose reference could jump.
+    """Raises ScenarioError if a real robot lacks limits or its reference could jump.
 
-    The reference is the position that an arm follows. It could jump when messages of another
-    arm stop arriving or arrive again, except under the rule "glide". The check is made only
-    before a session, because the scenarios in logs of earlier versions may lack these keys.
+    Except under the stale rule "glide", the reference could jump when samples of a peer stop
+    arriving or arrive again. The check is performed only before a session, since the scenarios
+    in logs of earlier versions may lack these keys.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
 
     Raises:
         ScenarioError: A key is missing or wrong. The error contains the path of the first such
@@ -131,13 +130,13 @@ def check_outside_arms(scenario: Scenario) -> None:
 
 
 def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
-    """Refuses a real robot whose reference position may jump when another arm falls silent.
+    """Raises ScenarioError if the reference of a real robot may jump when a peer falls silent.
 
-    A jump would move the robot suddenly. The rule for silent arms must therefore be "glide".
+    A jump would move the robot suddenly, so the stale rule must be "glide".
 
     Args:
-        scenario: Description of the experiment.
-        name: Name of the site with the robot.
+        scenario: The scenario.
+        name: Name of the site of the robot.
     """
     action = scenario.sites[name].on_stale.action
     if action != "glide":
@@ -150,15 +149,16 @@ def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
 
 
 def _check_law(name: str, site: SiteSpec, sites: int) -> None:
-    """Refuses a control law that an arm cannot use, for example because its masses are unknown.
+    """Raises ScenarioError if an arm cannot use its control law.
 
-    Settings that contradict the way in which the arm moves are refused as well. An arm is
-    simulated by the program, simulated by a user's class, or a real robot.
+    This can be the case, for example, because the masses of the arm are unknown. Settings that
+    contradict the kind of plant (simulated by the program, simulated by a user's class, or a
+    real robot) are also rejected.
 
     Args:
         name: Name of the site, for error messages.
-        site: Description of the site, with its control law and plant.
-        sites: Number of sites of the scenario.
+        site: The site, with its control law and plant.
+        sites: Number of sites in the scenario.
 
     Raises:
         ScenarioError: A condition fails. The error contains the path of the key.
@@ -188,7 +188,9 @@ def _check_law(name: str, site: SiteSpec, sites: int) -> None:
 
 
 def _check_plant(path: str, site: SiteSpec) -> None:
-    """Refuses settings that only a simulated arm can have, or only a real robot.
+    """Raises ScenarioError for settings that only the other kind of plant can have.
+
+    Some settings are reserved for simulated arms, others for real robots.
 
     Args:
         path: Path of the site, for error messages.
@@ -219,16 +221,17 @@ def _check_plant(path: str, site: SiteSpec) -> None:
 
 
 def build_scenario(resolved: TomlTable) -> Scenario:
-    """Converts complete tables of a scenario to an object, and checks them against each other.
+    """Converts the complete tables of a scenario to a `Scenario` and validates it.
 
-    The order of the checks decides which error is reported if a scenario contains several.
+    If a scenario contains several errors, the order of the checks determines which one is
+    reported.
 
     Args:
         resolved: Tables from `resolve.resolve_scenario`.
 
     Raises:
-        ScenarioError: A value has a wrong type or range, or values contradict each other. The
-            error contains the path of the key.
+        ScenarioError: A value has a wrong type or is out of range, or values contradict each
+            other. The error contains the path of the key.
     """
     scenario = convert_drawn(
         table=resolved,
@@ -271,9 +274,9 @@ def build_scenario(resolved: TomlTable) -> Scenario:
 
 
 def _normalise_change(change: Change) -> Change:
-    """Returns a change with its link written in the same format as the links of the scenario.
+    """Returns a change with its link formatted like the links of the scenario.
 
-    Authors may write 350 or 350.0. Both must give the same text, so that both are the same
+    Authors may write 350 or 350.0. Both must give the same text, so that they are the same
     experiment with the same hash.
     """
     if not change.link:
@@ -282,13 +285,13 @@ def _normalise_change(change: Change) -> Change:
 
 
 def _check_joint_space(scenario: Scenario) -> None:
-    """Refuses arms that cannot share coordinates, and laws that do not support chains.
+    """Raises ScenarioError if arms cannot share coordinates, or a law does not support chains.
 
-    All sites share either joint angles or the pose of the end effector. Joint angles can only
-    be compared between arms with the same number of joints.
+    All sites share either joint angles or the pose of the end effector. Joint angles can be
+    compared only between arms with the same number of joints.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     joint_counts = {name: model.counts.joints for name, model in scenario.arms.items()}
     spaces = {name: site.task.space for name, site in scenario.sites.items()}
@@ -324,7 +327,7 @@ def _check_joint_space(scenario: Scenario) -> None:
 
 
 def _check_links(scenario: Scenario) -> None:
-    """Refuses network links and delayed views of users with contradictory keys."""
+    """Raises ScenarioError if a link, or the delayed view of a user, has contradictory keys."""
     links = {f"links.{name}": link for name, link in scenario.links.items()}
     views = {
         f"sites.{name}.view": site.view for name, site in scenario.sites.items() if site.view
@@ -343,12 +346,12 @@ def _check_links(scenario: Scenario) -> None:
 
 
 def _check_damping(scenario: Scenario) -> None:
-    """Refuses damping gains that are too large for the inertia of a light joint of a chain.
+    """Raises ScenarioError if a damping gain is too large for a light joint of a chain.
 
-    A damping torque -K qd is held for one control period h. A single joint of inertia M then
+    A damping torque -K qd is held for one control period h. A single joint with inertia M then
     oscillates from period to period if K h / M >= 1 with the second-order scheme, or K h / M >=
-    2 with the digital scheme. For several joints, the largest eigenvalue of K M^-1 takes the
-    place of K / M. It is computed for the start pose.
+    2 with the digital scheme. For several joints, K / M is replaced with the largest eigenvalue
+    of K M^-1, computed at the start pose.
     """
     for name, model in scenario.arms.items():
         site = scenario.sites[name]
@@ -381,10 +384,10 @@ def _check_damping(scenario: Scenario) -> None:
 
 
 def _check_received(scenario: Scenario) -> None:
-    """Refuses vectors of unequal length that an arm receives from several laws under one name.
+    """Raises ScenarioError if an arm receives vectors of one name but different lengths.
 
-    A control law may send additional vectors to the other arms, each with a name. A receiver
-    stores vectors of the same name in one array, so their lengths must agree.
+    A control law may send additional named vectors to the other arms. A receiver stores vectors
+    of the same name in one array, so their lengths must agree.
     """
     for site in scenario.names:
         first_senders: dict[str, tuple[str, int]] = {}
@@ -401,10 +404,10 @@ def _check_received(scenario: Scenario) -> None:
 
 
 def _check_energy_laws(scenario: Scenario) -> None:
-    """Refuses scenarios in which only some arms have a law that keeps an account of energy.
+    """Raises ScenarioError if only some arms have a law that keeps an energy account.
 
-    Such a law proves stability by counting the energy that enters and leaves each network link,
-    which works only if both ends count. It may have further conditions on the integration
+    Such a law proves stability by accounting for the energy that enters and leaves each network
+    link, which requires both ends to do so. It may have further conditions on the integration
     scheme and the rates of the control loops.
     """
     laws = {name: site.control for name, site in scenario.sites.items()}
@@ -417,15 +420,15 @@ def _check_energy_laws(scenario: Scenario) -> None:
 def _check_energy_law(
     scheme: str, name: str, laws: dict[str, LawSettings], rates_hz: dict[str, int]
 ) -> None:
-    """Refuses a control law that accounts for energy at one arm, if the other arms do not fit.
+    """Raises ScenarioError if the other arms do not fit an arm whose law accounts for energy.
 
-    For example, the other arms may use another law, or control loops with other rates.
+    For example, they may use another law, or control loops with other rates.
 
     Args:
         scheme: Integration scheme of the scenario.
-        name: Name of the site whose law counts energy.
-        laws: Law of every site, by name.
-        rates_hz: Tick rate of every site, by name.
+        name: Name of the site whose law accounts for energy.
+        laws: Mapping from site name to law.
+        rates_hz: Mapping from site name to tick rate, in Hz.
     """
     law = laws[name]
     tag = law.tag
@@ -448,12 +451,12 @@ def _check_energy_law(
 
 
 def _check_start_poses(scenario: Scenario) -> None:
-    """Refuses start poses in which a joint is far beyond one of its mechanical stops.
+    """Raises ScenarioError if a joint starts too far beyond one of its mechanical stops.
 
-    A joint may be beyond a stop by at most the margin of `start_margin`.
+    The largest permitted distance is `start_margin`.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     for name, model in scenario.arms.items():
         if model.chain is None:
@@ -476,9 +479,9 @@ def _check_start_poses(scenario: Scenario) -> None:
 
 
 def _check_limits(scenario: Scenario, name: str) -> None:
-    """Refuses limits of joint positions that contradict each other or exclude the start pose.
+    """Raises ScenarioError for position limits that are inconsistent or exclude the start pose.
 
-    Limits that can never have an effect are refused as well.
+    Limits that can never have an effect are also rejected.
 
     Args:
         scenario: The scenario.
@@ -523,11 +526,12 @@ def _check_task_poses(scenario: Scenario) -> None:
 
 
 def _check_task_pose(scenario: Scenario, name: str) -> None:
-    """Refuses a start pose from which the end effector cannot move along all followed axes.
+    """Raises ScenarioError if the end effector cannot move along all axes that it follows.
 
-    The Jacobian J of the end effector has a row per followed axis. A row of zeros is an axis
-    along which no joint moves the end effector. If J does not have full row rank, the pose is
-    singular: the end effector cannot move along some combination of the axes.
+    The Jacobian J of the end effector, evaluated at the start pose, has one row per followed
+    axis. A row of zeros is an axis along which no joint moves the end effector. If J does not
+    have full row rank, the pose is singular: the end effector cannot move along some
+    combination of the axes.
 
     Args:
         scenario: The scenario.
@@ -575,17 +579,16 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
 
 
 def find_row_problem(row: Array, site: int) -> str | None:
-    """Returns why a row of the dominance matrix is not valid, Eq. (7), or None if it is.
+    """Checks one row of the dominance matrix, Eq. (7).
 
-    The row contains the weights with which one arm follows the others. They must lie between 0
-    and 1 and sum to 1, and the arm must not follow itself.
+    The factors must lie between 0 and 1 and sum to 1, and the arm must not follow itself.
 
     Args:
         row: Dominance factors of one site, shape (N,).
         site: Index of that site.
 
     Returns:
-        A clause for an error message. None if the row is valid.
+        The problem as a clause for an error message, or None if the row is valid.
     """
     if not np.isfinite(row).all():
         return "shares must be finite numbers"
@@ -601,10 +604,10 @@ def find_row_problem(row: Array, site: int) -> str | None:
 def _check_actors(
     actors: Sequence[operators.Operator | operators.Environment], path: str
 ) -> None:
-    """Refuses operators, or environments such as walls, whose settings contradict each other.
+    """Raises ScenarioError if the settings of an operator or environment are contradictory.
 
     Args:
-        actors: The operators or bodies of one site.
+        actors: The operators or environments of one site.
         path: Path of their list, for error messages.
     """
     for n, actor in enumerate(actors):
@@ -614,11 +617,11 @@ def _check_actors(
 
 
 def _check_hands(site: SiteSpec, path: str) -> None:
-    """Refuses operators who cannot move an arm in the way that the experiment states.
+    """Raises ScenarioError if an operator cannot move the arm as the scenario specifies.
 
-    An arm has at most one live operator: a person, or a program in the session, who moves the
-    arm during the run. The program must simulate this arm. A user's program acts in every n-th
-    control period, so its rate must divide the rate of the control loop.
+    An arm has at most one live operator (a person or a program in the session), and must be
+    simulated by the program. A user's program acts in every n-th control period, so its rate
+    must divide the rate of the control loop.
 
     Args:
         site: The site.
@@ -648,14 +651,14 @@ def _check_hands(site: SiteSpec, path: str) -> None:
 
 
 def check_links_memory(scenario: Scenario, site: str) -> None:
-    """Refuses network links on which too many messages would wait for the memory.
+    """Raises ScenarioError if messages waiting on the links would need too much memory.
 
     A message waits at the receiver until its simulated delay has passed. The memory grows with
-    the delay, the rate of the control loop and the number of arms. `MAX_LINKS_BYTES` is the
-    limit.
+    the delay, the rate of the control loop and the number of arms, and is limited to
+    `MAX_LINKS_BYTES`.
 
     Args:
-        scenario: Description of the experiment, with its links and tick rates.
+        scenario: The scenario, with its links and tick rates.
         site: Name of the site that receives the samples.
 
     Raises:
@@ -673,14 +676,14 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
 
 
 def _check_stale_rules(scenario: Scenario) -> None:
-    """Refuses time limits for silent arms that would be exceeded in normal operation.
+    """Raises ScenarioError if a stale rule would be triggered in normal operation.
 
-    An arm counts as silent if its last message is too old. The period between two messages, and
-    the fixed delay of the network link, must be below the limit. Otherwise the receiver would
-    wait during the whole run.
+    A peer counts as silent if its last sample is too old. The interval between two samples, and
+    the fixed delay of the link, must be below the limit. Otherwise, the receiver would wait
+    during the entire run.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     _check_lost(scenario)
     for name, site in scenario.sites.items():
@@ -712,13 +715,13 @@ def _check_stale_rules(scenario: Scenario) -> None:
 
 
 def _check_lost(scenario: Scenario) -> None:
-    """Refuses the rule "degrade" if no site can continue without one of the masters.
+    """Raises ScenarioError if the rule "degrade" is set but no site can lose a master.
 
-    Under this rule, a site continues without a master (an arm that leads) that has become
-    silent. It then needs another site that it follows.
+    Under this rule, a site continues without a master that has fallen silent, which requires
+    another site for it to follow.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     degrading = [
         name for name, site in scenario.sites.items() if site.on_stale.on_lost == "degrade"
@@ -739,11 +742,10 @@ def _check_lost(scenario: Scenario) -> None:
 
 
 def _can_lose_master(scenario: Scenario, name: str) -> bool:
-    """Returns True if an arm can continue after some master that it follows has fallen silent.
+    """Returns True if a site can continue after some master that it follows has fallen silent.
 
-    A master is an arm that a person moves. The arm must follow another arm as well. The
-    remaining arms must all follow each other, directly or through others (irreducible matrix of
-    weights).
+    The site must also follow another site. The remaining sites must all follow each other,
+    directly or through others (irreducible dominance matrix).
 
     Args:
         scenario: The scenario.
@@ -763,17 +765,16 @@ def _can_lose_master(scenario: Scenario, name: str) -> bool:
 
 
 def check_change(change: Change, path: str) -> None:
-    """Checks that a link has valid settings after a change during a run.
+    """Raises ScenarioError if a link would have invalid settings after a change.
 
-    A link is the one-way network connection between two sites, the processes of the arms. Other
-    changes are accepted, because they have been checked before.
+    Changes other than those of a link have already been checked and are accepted.
 
     Args:
-        change: The change, of a link or of the weights with which a site follows the others.
+        change: Change of a link or of a site's dominance factors.
         path: Path of the change in the scenario, for error messages.
 
     Raises:
-        ScenarioError: A setting of the link is not valid, or the change of a link states a
+        ScenarioError: A setting of the link is not valid, or the change of a link specifies a
             transition time. The error contains the path of the key.
     """
     if not change.link:

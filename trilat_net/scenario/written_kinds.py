@@ -1,9 +1,8 @@
-"""Derives the type of a table that an author may write from the type of the complete table.
+"""Derives the type of a table as written by an author from the type of the complete table.
 
-A scenario is a TOML file that describes an experiment. In a complete scenario, each key has a
-value. Its author may leave keys out, write one number in place of a vector with equal entries,
-and write a random distribution in place of a number. Without this module, each table would have
-two types with the same keys and ranges.
+In a complete scenario, every key has a value. Its author may leave out keys, write a number in
+place of a vector of equal entries, and write a random distribution in place of a number.
+Deriving the type avoids declaring each table twice with the same keys and ranges.
 """
 
 from functools import cache
@@ -22,14 +21,14 @@ from .key_checks import StructType, find_extra, list_fields
 def written_kind(
     kind: StructType, *other_keys: str, takes_distributions: bool = True
 ) -> StructType:
-    """Derives the type of a table that an author may write from the type of the complete table.
+    """Derives the type of a table as written by an author from its complete type.
 
-    Every key may be left out. A single number may stand for a vector with one number per joint,
-    axis or parameter.
+    Every key becomes optional. A scalar may stand for a vector with one entry per joint, axis
+    or parameter.
 
     Args:
         kind: Type of the complete table, for example `Limits`.
-        other_keys: Keys that an author may write in addition. Their values are texts.
+        other_keys: Additional keys that an author may write, with string values.
         takes_distributions: True if a random distribution may take the place of each number.
     """
     fields: list[tuple[str, Any, Any]] = [(key, str, UNSET) for key in other_keys]
@@ -43,9 +42,7 @@ def written_kind(
 
 
 def written_type(hint: Any, takes_distributions: bool) -> Any:
-    """Returns the type that an author may write for a key, from the type of its complete value.
-
-    For example, a single number may take the place of a vector with a number per joint.
+    """Derives the type that an author may write for a key from the type of its complete value.
 
     In place of a number, an author may write a distribution. In place of a vector with one
     entry per joint, an author may write a number, a distribution, or a list of both.
@@ -82,9 +79,9 @@ def written_type(hint: Any, takes_distributions: bool) -> Any:
 
 
 def _list_type(hint: Any, takes_distributions: bool) -> Any:
-    """Returns the type of the list that an author may write for the type of a complete list.
+    """Returns the type of the list that an author may write in place of a complete list.
 
-    The length of a vector depends on the arm, and is checked when the arm is known.
+    The length of a vector depends on the arm, and is checked once the arm is known.
     """
     base, annotations = _split_annotation(hint)
     entry = get_args(base)[0]
@@ -103,7 +100,7 @@ def _list_type(hint: Any, takes_distributions: bool) -> Any:
 
 
 def _split_annotation(hint: Any) -> tuple[Any, tuple[Meta, ...]]:
-    """Splits the annotation of a field into the type itself and its limits."""
+    """Splits the annotation of a field into the type and its limits."""
     if get_origin(hint) is Annotated:
         return get_args(hint)[0], hint.__metadata__
     return hint, ()

@@ -1,17 +1,17 @@
-"""Defines the tables that the author of a scenario may write, and refuses all other tables.
+"""Types of the tables that the author of a scenario may write.
 
-A scenario is a TOML file that describes an experiment. Its author writes less than the program
-needs: most keys may be left out, tables such as `[arm]` apply to all sites, one number may
-stand for a vector, and a random distribution may stand for a number. `WrittenScenario` is the
-type of such a file, and `scenario_types.Scenario` the type of the complete description.
+An author writes less than the program needs: most keys may be left out, tables such as `[arm]`
+apply to all sites, one number may stand for a vector, and a random distribution may stand for a
+number. `WrittenScenario` is the type of such a file, and `scenario_types.Scenario` is the type
+of the complete scenario.
 
-The keys of some tables depend on one of their values, such as the law of `[control]`. These
-tables are checked separately, as soon as that value is known: by `check_control`, `check_link`
-and `operators.resolve_operators`.
+The keys of some tables depend on one of their values, such as the law in `[control]`. These
+tables are checked separately, once that value is known, by `check_control`, `check_link` and
+`operators.resolve_operators`.
 
 Invariant:
-    - The keys, types and ranges of a group such as `arm` are stated once, in its complete type.
-      The type of the written table follows from it, see `written_kind`.
+    - The keys, types and ranges of a group such as `arm` are declared once, in its complete
+      type. The type of the written table is derived from it (see `written_kind`).
 """
 
 import re
@@ -36,12 +36,12 @@ from .suggestions import list_group_paths
 from .written_kinds import written_kind, written_type
 
 MAX_SITES = 32
-"""Largest number of sites of an experiment. Every pair of sites has two links."""
+"""Maximum number of sites. Every pair of sites has two links."""
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED_NAME = "recorder"
-"""Name that no site may have, because it is the name of the program that writes the log."""
+"""Name that no site may have, since the program that writes the log uses it."""
 TRACE_KEYS = ("file", "of")
-"""Keys of a link that name a file of delays. A resolved link contains the delays instead."""
+"""Keys of a link that name a delay file. A resolved link contains the delays instead."""
 
 
 if TYPE_CHECKING:
@@ -73,22 +73,22 @@ _LINK_TABLES: dict[str, StructType] = {
 _LAW_TABLES: dict[str, StructType] = {
     law: written_kind(kind, "law") for law, kind in LAWS.items()
 }
-"""Types of the tables of a link and of a control law, by the name of the model or law."""
+"""Mapping from name to table type, for delay models and for control laws."""
 for _kind in _LINK_TABLES.values():
     # The types are used once now, because msgspec 0.22 crashes if two threads first use a type
     # at once.
     msgspec.convert({}, _kind)
 _USER_LAW = "own"
-"""Name that all laws of users have. Since their arguments differ, a message about a misplaced
-key does not name them as the owners of the key.
+"""Name shared by all users' laws. Since their arguments differ, messages about misplaced keys
+do not mention them.
 """
 
 
 class WrittenSite(Frozen, frozen=True, kw_only=True):
-    """Table of one arm as an author may write it.
+    """Table of one site as written by an author.
 
-    The complete form is `site_spec.SiteSpec`. The keys of `control`, `view` and of the
-    tables in the lists depend on the kind that the table names.
+    `site_spec.SiteSpec` is the complete form. The keys of `control`, `view` and the tables in
+    the lists depend on the kind named in the table.
     """
 
     role: Literal["master", "slave"] | UnsetType = UNSET
@@ -107,10 +107,9 @@ class WrittenSite(Frozen, frozen=True, kw_only=True):
 
 
 class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
-    """Planned change of a network link, or of weights, as an author may write it.
+    """Planned change of a network link or of dominance factors, as written by an author.
 
-    The weights (dominance factors) state how much an arm follows the others. The keys of `to`
-    depend on what is changed, see `change.Change`.
+    The keys of `to` depend on what is changed (see `change.Change`).
     """
 
     at_s: Annotated[float, Meta(extra={"must_be": "a time in s"})]
@@ -121,18 +120,18 @@ class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class WrittenScenario(Frozen, frozen=True, kw_only=True):
-    """Tables of a scenario file as its author may write them, with many keys left out.
+    """A scenario file as written by an author, with many keys left out.
 
     `scenario_types.Scenario` is the complete form.
 
     Attributes:
-        rate_hz: Tick rate of all sites that state no other, in Hz.
-        arm: Keys of the arms of all sites. A site may state other values.
-        limits: Limits of all sites.
-        on_stale: Stale rule of all sites.
-        task: Shared coordinates of all sites.
-        control: Control law of all sites, with its gains.
-        link: Settings of all links.
+        rate_hz: Default tick rate, in Hz.
+        arm: Default arm of all sites.
+        limits: Default limits of all sites.
+        on_stale: Default stale rule of all sites.
+        task: Default shared coordinates of all sites.
+        control: Default control law of all sites, with its gains.
+        link: Default settings of all links.
     """
 
     name: ScenarioName
@@ -161,18 +160,19 @@ class WrittenScenario(Frozen, frozen=True, kw_only=True):
 
     @classmethod
     def check(cls, tables: TomlTable) -> "WrittenScenario":
-        """Refuses a scenario file with an unknown key, or a value of a wrong type or range.
+        """Converts the tables of a scenario file to a `WrittenScenario`.
 
         Conditions that involve several tables are checked later.
 
         Args:
-            tables: Tables of the file as its author wrote them.
+            tables: Tables of the file as written by its author.
 
         Returns:
-            The tables as typed values, with the defaults of the whole scenario.
+            The typed tables, with the defaults of scenario-level keys filled in.
 
         Raises:
-            ScenarioError: A key is unknown or missing, or a value has a wrong type or range.
+            ScenarioError: A key is unknown or missing, or a value has a wrong type or is out of
+                range.
         """
         check_finite(tables, "")
         try:
@@ -187,7 +187,7 @@ class WrittenScenario(Frozen, frozen=True, kw_only=True):
 
 
 def _check_site_names(names: Collection[str]) -> None:
-    """Refuses names that an arm cannot have, and too few or too many arms in a scenario.
+    """Raises ScenarioError if a site name, or the number of sites, is not valid.
 
     Args:
         names: Names of the sites.
@@ -215,10 +215,10 @@ def _check_site_names(names: Collection[str]) -> None:
 
 
 def check_control(table: TomlTable, law: str, path: str) -> None:
-    """Refuses a control law's table with a key that the law does not have, or a wrong gain.
+    """Raises ScenarioError if a `control` table has an unknown key or an invalid gain.
 
     Args:
-        table: The table as its author wrote it.
+        table: The table as written by its author.
         law: Name of a built-in law, or "own".
         path: Dotted path of the table.
     """
@@ -227,10 +227,10 @@ def check_control(table: TomlTable, law: str, path: str) -> None:
 
 
 def check_link(table: TomlTable, model: str, path: str) -> None:
-    """Refuses a network link's table with a key that its delay model does not have.
+    """Raises ScenarioError if a link table has a key that its delay model does not have.
 
     Args:
-        table: The table as its author wrote it.
+        table: The table as written by its author.
         model: Name of the delay model.
         path: Dotted path of the table.
     """
@@ -244,17 +244,17 @@ def check_link(table: TomlTable, model: str, path: str) -> None:
 def _check_foreign_keys(
     table: TomlTable, kinds: Mapping[str, StructType], group: str, chosen: str, path: str
 ) -> None:
-    """Refuses a key that does not belong to the chosen control law or delay model.
+    """Raises ScenarioError if a key belongs to another control law or delay model.
 
-    Upper and lower case count as equal, so that the user of `control.D` learns of `d`. If a key
-    differs from a valid key only in its case, `check_table` refuses it and suggests the valid
+    The comparison ignores case, so that the user of `control.D` learns about `d`. A key that
+    differs from a valid key only in case is rejected by `check_table`, which suggests the valid
     key.
 
     Args:
         table: Table of a control law or a delay model.
         kinds: Types of the tables of all laws or models.
         group: "law" or "model".
-        chosen: The law or model of the table.
+        chosen: Name of the law or model of the table.
         path: Dotted path of the table.
 
     Raises:

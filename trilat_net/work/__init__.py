@@ -15,14 +15,10 @@ __all__ = [
     "Progress",
     "WorkerPool",
     "Workers",
-    "check_workers",
-    "count_workers",
     "ignore_progress",
-    "open_worker_pool",
     # Folders of studies
     "RunJournal",
     "StudyFolder",
-    "build_resume_hint",
     "encode_csv",
     # Intervals of confidence
     "MeanInterval",
@@ -30,27 +26,15 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .executor import (
-        MAX_LOSSES,
-        Progress,
-        WorkerPool,
-        Workers,
-        check_workers,
-        count_workers,
-        ignore_progress,
-        open_worker_pool,
-    )
+    from .executor import MAX_LOSSES, Progress, WorkerPool, Workers, ignore_progress
     from .intervals import MeanInterval, wilson_interval
-    from .study_folder import RunJournal, StudyFolder, build_resume_hint, encode_csv
+    from .study_folder import RunJournal, StudyFolder, encode_csv
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "executor": (
-                "MAX_LOSSES Progress WorkerPool Workers check_workers count_workers "
-                "ignore_progress open_worker_pool"
-            ),
+            "executor": "MAX_LOSSES Progress WorkerPool Workers ignore_progress",
             "intervals": "MeanInterval wilson_interval",
-            "study_folder": "RunJournal StudyFolder build_resume_hint encode_csv",
+            "study_folder": "RunJournal StudyFolder encode_csv",
         },
     )

@@ -147,34 +147,34 @@ class WorkerRequirements(NamedTuple):
         Raises:
             UsageError: This process differs. The message names the worker and the differences.
         """
-        reason = self.explain_unfit_worker(describe_worker(), find_missing_laws(self.laws))
+        reason = self.explain_unfit_worker(describe_worker(), self.find_missing_laws(self.laws))
         if reason:
             worker = _import_distributed().get_worker()
             raise UsageError(f"the worker {worker.address} {reason}")
+
+    @staticmethod
+    def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
+        """Finds the users' control laws whose file this process lacks or has otherwise.
+
+        A worker without the right file could not run the study, or would compute other results.
+
+        Args:
+            laws: Name of each law, with the SHA-256 of its file.
+        """
+        missing = []
+        for code, sha256 in laws:
+            try:
+                local_sha256 = read_code(code, "control.law").sha256
+            except ScenarioError:
+                local_sha256 = ""
+            if local_sha256 != sha256:
+                missing.append(code)
+        return missing
 
 
 def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
     """Formats some properties of a worker as text for an error message."""
     return ", ".join(f"{name} {identity.get(name, 'unknown')}" for name in names)
-
-
-def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-    """Finds the users' control laws whose file this process lacks, or has in another version.
-
-    A worker without the right file could not run the study, or would compute other results.
-
-    Args:
-        laws: Name of each law, with the SHA-256 of its file.
-    """
-    missing = []
-    for code, sha256 in laws:
-        try:
-            local_sha256 = read_code(code, "control.law").sha256
-        except ScenarioError:
-            local_sha256 = ""
-        if local_sha256 != sha256:
-            missing.append(code)
-    return missing
 
 
 def _make_probe() -> Callable[
@@ -201,7 +201,8 @@ def _make_probe() -> Callable[
             from trilat_net.work import dask_cluster
         except ImportError:
             return {"trilat-net": "of another version, or none"}, ()
-        return dask_cluster.describe_worker(), dask_cluster.find_missing_laws(laws)
+        missing_laws = dask_cluster.WorkerRequirements.find_missing_laws(laws)
+        return dask_cluster.describe_worker(), missing_laws
 
     return probe
 

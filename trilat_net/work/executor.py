@@ -263,7 +263,7 @@ class _Feed(Generic[T]):
 class WorkerPool:
     """Runs the items of a study in parallel, in processes on this machine or on a cluster.
 
-    An item is an independent piece of work, such as one simulated run. `open_worker_pool`
+    An item is an independent piece of work, such as one simulated run. `open`
     creates this object. A study passes its items to `map`, or to `iterate_results` if it stores
     each result at once.
 
@@ -296,6 +296,103 @@ class WorkerPool:
         self._required = required
         self._hint = hint
         self.is_local = executor is None
+
+    @classmethod
+    @contextmanager
+    def open(
+        cls,
+        jobs: int | None,
+        on: Workers = None,
+        *,
+        most: int | None = None,
+        laws: Sequence[tuple[str, str]] = (),
+        hint: str = "",
+    ) -> Iterator["WorkerPool"]:
+        """Starts the worker processes of a study, or connects to the workers of a cluster.
+
+        The method is used in a `with` statement. Processes that it started end when the
+        statement is left. Workers of a cluster keep running.
+
+        Args:
+            jobs: Number of processes on this machine. If `None`, all cores are used. If 1, the
+                items run in this process.
+            on: Workers to use instead of processes on this machine.
+            most: Number of items. No more processes than this are started.
+            laws: Name of each imported class that the items need, with the SHA-256 of its file.
+                Each worker must have the files.
+            hint: Advice for the user that follows the message about a dead worker.
+
+        Raises:
+            UsageError: The cluster cannot be reached, a worker does not meet the requirements,
+                or a library is missing.
+        """
+        require_libraries()
+        with ExitStack() as stack:
+            if isinstance(on, str):
+                cluster = stack.enter_context(DaskCluster(on))
+                required = cluster.require(laws)
+                yield cls(
+                    executor=cluster.executor,
+                    workers=cluster.workers,
+                    restart=None,
+                    cluster=cluster,
+                    required=required,
+                    hint=hint,
+                )
+            elif on is not None:
+                yield cls(on, getattr(on, "_max_workers", count_cores()), hint=hint)
+            else:
+                count = jobs or count_cores()
+                if most is not None:
+                    count = min(count, most)
+
+                def start_processes() -> Executor:
+                    processes: AbstractContextManager[Executor] = worker_pool(count)
+                    return stack.enter_context(processes)
+
+                if count > 1:
+                    yield cls(start_processes(), count, start_processes, hint=hint)
+                else:
+                    yield cls(None, 1)
+
+    @staticmethod
+    def check_options(jobs: int | None, on: Workers) -> None:
+        """Rejects the options --jobs and --on together: --jobs has no effect on a cluster.
+
+        The option --jobs sets the number of processes on this machine, and --on selects a
+        cluster.
+
+        Args:
+            jobs: Value of --jobs. `None` if it was not given.
+            on: Value of --on. `None` if it was not given.
+
+        Raises:
+            UsageError: Both options are given.
+        """
+        if on is not None and jobs is not None:
+            raise UsageError(
+                "--jobs sets the number of processes on this machine: leave it out with --on"
+            )
+
+    @classmethod
+    def count_workers(cls, jobs: int | None, on: Workers = None) -> int:
+        """Returns how many items of a study will run at the same time.
+
+        For a cluster, this connects to its scheduler and checks its workers.
+
+        Args:
+            jobs: Number of processes on this machine. If `None`, all cores are used.
+            on: Workers to use instead of processes on this machine.
+
+        Raises:
+            UsageError: The cluster cannot be reached, or a worker does not meet the
+                requirements.
+        """
+        cls.check_options(jobs, on)
+        if on is None:
+            return jobs or count_cores()
+        with cls.open(None, on) as pool:
+            return pool.workers
 
     def iterate_results(
         self,
@@ -499,97 +596,3 @@ class WorkerPool:
             raise RunFailed(f"a worker process ended unexpectedly{self._hint}") from None
         if broken is self._executor:
             self._executor = self._restart()
-
-
-@contextmanager
-def open_worker_pool(
-    jobs: int | None,
-    on: Workers = None,
-    *,
-    most: int | None = None,
-    laws: Sequence[tuple[str, str]] = (),
-    hint: str = "",
-) -> Iterator[WorkerPool]:
-    """Starts the worker processes of a study, or connects to the workers of a cluster.
-
-    The function is used in a `with` statement. Processes that it started end when the statement
-    is left. Workers of a cluster keep running.
-
-    Args:
-        jobs: Number of processes on this machine. If `None`, all cores are used. If 1, the
-            items run in this process.
-        on: Workers to use instead of processes on this machine.
-        most: Number of items. No more processes than this are started.
-        laws: Name of each imported class that the items need, with the SHA-256 of its file.
-            Each worker must have the files.
-        hint: Advice for the user that follows the message about a dead worker.
-
-    Raises:
-        UsageError: The cluster cannot be reached, a worker does not meet the requirements, or a
-            library is missing.
-    """
-    require_libraries()
-    with ExitStack() as stack:
-        if isinstance(on, str):
-            cluster = stack.enter_context(DaskCluster(on))
-            required = cluster.require(laws)
-            yield WorkerPool(
-                executor=cluster.executor,
-                workers=cluster.workers,
-                restart=None,
-                cluster=cluster,
-                required=required,
-                hint=hint,
-            )
-        elif on is not None:
-            yield WorkerPool(on, getattr(on, "_max_workers", count_cores()), hint=hint)
-        else:
-            count = jobs or count_cores()
-            if most is not None:
-                count = min(count, most)
-
-            def start_processes() -> Executor:
-                processes: AbstractContextManager[Executor] = worker_pool(count)
-                return stack.enter_context(processes)
-
-            if count > 1:
-                yield WorkerPool(start_processes(), count, start_processes, hint=hint)
-            else:
-                yield WorkerPool(None, 1)
-
-
-def check_workers(jobs: int | None, on: Workers) -> None:
-    """Rejects the options --jobs and --on together, because --jobs has no effect on a cluster.
-
-    The option --jobs sets the number of processes on this machine, and --on selects a cluster.
-
-    Args:
-        jobs: Value of --jobs. `None` if it was not given.
-        on: Value of --on. `None` if it was not given.
-
-    Raises:
-        UsageError: Both options are given.
-    """
-    if on is not None and jobs is not None:
-        raise UsageError(
-            "--jobs sets the number of processes on this machine: leave it out with --on"
-        )
-
-
-def count_workers(jobs: int | None, on: Workers = None) -> int:
-    """Returns how many items of a study will run at the same time.
-
-    For a cluster, this connects to its scheduler and checks its workers.
-
-    Args:
-        jobs: Number of processes on this machine. If `None`, all cores are used.
-        on: Workers to use instead of processes on this machine.
-
-    Raises:
-        UsageError: The cluster cannot be reached, or a worker does not meet the requirements.
-    """
-    check_workers(jobs, on)
-    if on is None:
-        return jobs or count_cores()
-    with open_worker_pool(None, on) as pool:
-        return pool.workers

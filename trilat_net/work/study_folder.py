@@ -29,7 +29,7 @@ from ..files import describe_write_error, refuse_link
 from .executor import Progress, Together, WorkerPool
 
 
-def extend_file(path: Path) -> BinaryIO:
+def _extend_file(path: Path) -> BinaryIO:
     """Opens a file for appending without a buffer, and creates it if it does not exist.
 
     Without a buffer, a line is in the file as soon as it is written, even if the process is
@@ -50,16 +50,6 @@ def extend_file(path: Path) -> BinaryIO:
         return os.open(name, flags | no_follow, 0o666)
 
     return open(path, "ab", buffering=0, opener=open_without_following)
-
-
-def build_resume_hint(*arguments: str) -> str:
-    """Returns a sentence that tells the user how to continue a study after the disk was full.
-
-    Args:
-        arguments: Arguments of the command that continues the study.
-    """
-    command = join_arguments(["trilat", *arguments])
-    return f"finished runs are kept: make room, and continue with: {command}"
 
 
 def encode_csv(
@@ -237,10 +227,20 @@ class RunJournal(Generic[E]):
                     offset += len(line)
                     is_torn = not line.endswith(b"\n")
 
-        self._file = extend_file(path)
+        self._file = _extend_file(path)
         if is_torn:
             # The last line is torn. It is ended here, so that it does not spoil the next one.
             self._write(b"\n")
+
+    @staticmethod
+    def build_resume_hint(*arguments: str) -> str:
+        """Returns a sentence on how to continue a study after the disk was full.
+
+        Args:
+            arguments: Arguments of the command that continues the study.
+        """
+        command = join_arguments(["trilat", *arguments])
+        return f"finished runs are kept: make room, and continue with: {command}"
 
     def __enter__(self) -> "RunJournal[E]":
         return self

@@ -10,7 +10,6 @@ import pytest
 from trilat_people.hand_impedance import HandImpedance, identify_hand
 
 import trilat_net as tn
-from trilat_net.analysis.theory.hand_files import read_hands
 from trilat_net.analysis.theory.port_passivity import HandMatrices
 from trilat_net.core.step.vectors import Array
 from trilat_net.errors import UsageError
@@ -116,7 +115,7 @@ def test_an_identified_hand_works_in_a_scenario(spring: HandImpedance) -> None:
 def test_json_of_a_hand_is_read_again(spring: HandImpedance, tmp_path: Path) -> None:
     file = tmp_path / "m1.json"
     file.write_text(json.dumps(spring.to_dict()), encoding="utf-8")
-    (again,) = read_hands([file])
+    again = HandMatrices.read(file)
     assert np.array_equal(again.B, spring.B)
     assert np.array_equal(again.M, spring.M)
     assert spring.summary().count(" +- ") == 12
@@ -165,4 +164,4 @@ def test_a_file_of_no_hand_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "m1.json"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(UsageError, match=r"m1\.json: does not contain the output"):
-        read_hands([file])
+        HandMatrices.read(file)

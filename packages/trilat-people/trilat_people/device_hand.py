@@ -1,23 +1,22 @@
-"""Moves an arm with a haptic input device, and renders the force of the arm on the device.
+"""Moves an arm with a haptic input device and renders the force of the arm on the device.
 
-The operator, the person who moves the arm, presses a button of the device, the clutch, and
-moves the device. The target of the arm then moves by the same distance, rotated and scaled by
-the settings of the scenario. While the clutch is not pressed, the operator can bring the device
-back to its middle position, and the target stays where it is. The reaction force of the arm is
-rendered on the device.
+The operator moves the device while pressing its clutch button. The target of the arm then moves
+by the same distance, rotated and scaled according to the scenario. While the clutch is
+released, the target stays in place and the operator can return the device to its middle
+position. The reaction force of the arm is rendered on the device.
 
 Invariant:
-    - The target moves only by changes of the device's position while the clutch is pressed.
-      Positions that are not finite numbers, jumps, and the position of a device that was just
-      connected do not move the target, because they are not motions of the operator.
-    - The target never leaves the region that the arm can reach. A motion of the device that
-      would lead out of this region is ignored, so that a motion back moves the arm at once.
-    - If the device sends nothing for some time, the arm is released. After any release, the
-      operator must press the clutch again, so that the arm never starts to move unexpectedly.
-    - The rendered force is zero while the clutch is not pressed, and if no recent record of the
-      arm is available.
-    - Targets are sent to the site only after a new state of the device. If the device or this
-      program stops working, the site receives no targets and releases the arm.
+    - The target is moved only by changes in device position while the clutch is pressed.
+      Non-finite positions, jumps, and the position of a newly connected device are ignored,
+      since they are not motions of the operator.
+    - The target never leaves the reachable region of the arm. Motion of the device beyond this
+      region is discarded, so moving back moves the arm immediately.
+    - If the device stops sending, the arm is released. After any release, the operator must
+      press the clutch again, so the arm never starts to move unexpectedly.
+    - The rendered force is zero while the clutch is released, or if there is no recent record
+      of the arm.
+    - A target is sent to the site only after a new device state. If the device or this program
+      stops working, the site receives no targets and releases the arm.
 """
 
 import math
@@ -30,57 +29,57 @@ from trilat_net.app import Device, DeviceState, Vector
 from trilat_net.core import GRIP_NS, SILENCE_NS, HandReach
 from trilat_net.errors import count_nouns
 from trilat_net.net import Clock, Hand
-from trilat_net.scenario import DeviceSettings
+from trilat_net.scenario import LiveHand
 
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""
 _MIN_STATE_GAP_S = 0.005
-"""Shortest time between two states that the detection of jumps assumes, in s.
+"""Shortest time between two states assumed in jump detection, in s.
 
 The operating system may deliver states late, and several at once.
 """
 _MAX_STATE_GAP_S = 0.05
-"""Longest time between two states that the detection of jumps assumes, in s."""
+"""Longest time between two states assumed in jump detection, in s."""
 _TRIPS_KEPT = 60_000
-"""Number of round trips that are kept for statistics."""
+"""Number of round trips kept for statistics."""
 
 
 class DeviceHand:
-    """Lets a person move an arm with an input device, and feel the arm's force on the device.
+    """Lets a person move an arm with an input device and feel the force of the arm.
 
-    The process of a live operator creates the object and calls `run`. It is an operator of the
-    arm: the motion of the device moves the target that the arm follows.
+    Created by the process of a live operator, which then calls `run`.
 
     Args:
-        hand: Connection to the site that runs the arm, in the role of its operator.
-        device: The input device, which a person moves.
-        settings: Settings for moving the arm with the device, and for rendering the force.
+        hand: Connection to the site of the arm, in the role of its operator.
+        device: The input device.
+        operator: Live operator in the scenario. Its device settings determine how the device
+            moves the arm and how the force is rendered.
         clock: Clock of this machine.
         reach: Region that the arm can reach. The target never leaves it.
 
     Attributes:
-        states: Number of states of the device (position, velocity, buttons) that were read.
-        jumps: Number of states that were ignored because the position had jumped.
-        unreadable: Number of states that were ignored because they contained NaN or infinity.
-        trips_ns: Times from a position of the device until the force caused by this position
-            was rendered, in ns.
+        states: Number of device states (position, velocity, buttons) that were read.
+        jumps: Number of states ignored because the position had jumped.
+        unreadable: Number of states ignored because they contained NaN or infinity.
+        trips_ns: Times from reading a device position to rendering the force caused by it, in
+            ns.
     """
 
     def __init__(
         self,
         hand: Hand,
         device: Device,
-        settings: DeviceSettings,
+        operator: LiveHand,
         clock: Clock,
         reach: HandReach,
     ) -> None:
         self._hand = hand
         self._device = device
-        self._settings = settings
+        self._settings = operator.device
         self._clock = clock
         self._reach = reach
         # The axes of the arm in the coordinates of the device, a row per axis of the arm.
-        self._axes = settings.rows(len(hand.pose))
+        self._axes = self._settings.rows(len(hand.pose))
 
         self.states = 0
         self.jumps = 0
@@ -94,9 +93,9 @@ class DeviceHand:
         self.release()
 
     def release(self) -> None:
-        """Stops moving the arm, so that motion of the input device has no effect on it.
+        """Stops moving the arm: motion of the input device has no further effect.
 
-        The arm stays released until the person presses the clutch, a button of the device.
+        The arm stays released until the operator presses the clutch of the device.
         """
         self._hand.release()
         # The target is empty while the arm is not held.
@@ -110,11 +109,10 @@ class DeviceHand:
         self._sent.clear()
 
     def serve(self) -> None:
-        """Moves the target of the arm with the device, and renders the force of the arm.
+        """Runs one cycle of the device, and is called repeatedly.
 
-        The method is called repeatedly. Each call takes one period of the device: it reads the
-        position, sends the new target to the site of the arm, and lets the device apply a force
-        to the person.
+        Reads the position of the device, sends the new target to the site of the arm, and makes
+        the device apply the force to the person.
 
         Raises:
             OSError: The device is silent, or its connection is lost.
@@ -145,12 +143,12 @@ class DeviceHand:
     def _follow(self, state: DeviceState, now_ns: int) -> None:
         """Applies the buttons of the device, and moves the target if the clutch is pressed.
 
-        The release button releases the arm. When the clutch is pressed for the first time, the
-        target starts at the present pose of the arm. Later it starts where it was left.
+        The release button releases the arm. The first time the clutch is pressed, the target
+        starts at the current pose of the arm; after that, it starts where it was left.
 
         Args:
-            state: State of the device, with finite numbers.
-            now_ns: Present time on the local clock, in ns.
+            state: State of the device, with finite values.
+            now_ns: Current time on the local clock, in ns.
         """
         settings = self._settings
         previous_position_m = self._position_m
@@ -184,8 +182,8 @@ class DeviceHand:
     def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
         """Moves the target of the arm by a motion of the device, rotated and scaled.
 
-        A motion that is faster than the speed limit of the scenario is a jump, for example
-        after a lost message. It is counted and ignored.
+        Motion above the speed limit of the scenario is treated as a jump, for example after a
+        lost message, which is counted and ignored.
 
         Args:
             step_m: Change of the device's position, in m.
@@ -205,10 +203,10 @@ class DeviceHand:
         self._target = list(self._reach.find_nearest(target))
 
     def _compute_force(self) -> Vector:
-        """Computes the force to render, the reaction force of the arm in device coordinates.
+        """Computes the force to render: the reaction force of the arm in device coordinates.
 
-        The force grows from zero within `GRIP_NS` after the clutch was pressed. It is zero if
-        the clutch is not pressed, the newest record is old, or this operator does not hold the
+        The force is faded in over `GRIP_NS` after the clutch is pressed. It is zero if the
+        clutch is released, the newest record is too old, or this operator does not hold the
         arm.
 
         Returns:
@@ -232,11 +230,11 @@ class DeviceHand:
         return x, y, z
 
     def _measure_trips(self) -> None:
-        """Measures the round trip time from a position of the device to the rendered force.
+        """Measures the round-trip time from a device position to the rendered force.
 
-        Each target was sent with a number. The newest record of the site states the number of
-        the target that the arm follows. The round trips of this target and of all earlier
-        targets end with the force that was just rendered.
+        Each target is sent with a number, and the newest record of the site contains the number
+        of the target that the arm follows. The round trips of this target and of all earlier
+        ones end with the force that was just rendered.
         """
         used_number = self._hand.number
         now_ns = self._clock.monotonic_ns()
@@ -248,16 +246,16 @@ class DeviceHand:
             self.trips_ns.append(now_ns - sent_ns)
 
     def describe(self) -> str:
-        """Returns a line for the user about the states of the device and the round trip times.
+        """Returns a line of text with statistics of device states and round-trip times.
 
-        A state is a message of the device with its position. It is dropped if it cannot be
-        read, or if it is a jump: farther from the previous position than the speed limit of the
-        scenario allows. A round trip begins when a position of the device is sent to the arm.
-        It ends when the device renders the force with which the arm reacts to this position.
+        A state is dropped if it cannot be read or is a jump, that is, farther from the previous
+        position than the speed limit of the scenario allows. A round trip lasts from sending a
+        device position to the arm until the device renders the force with which the arm reacts
+        to it.
 
         Returns:
-            The numbers of received states, of jumps and of unreadable states. If a round trip
-            was measured, also the median and the 99th percentile of the round trip time in ms.
+            The number of states received, of jumps and of unreadable states, and, if a round
+            trip was measured, the median and 99th percentile of the round-trip time in ms.
         """
         states = count_nouns(self.states, "state")
         jumps = count_nouns(self.jumps, "jump")
@@ -274,11 +272,11 @@ class DeviceHand:
     def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
         """Moves the arm with the device until the session ends.
 
-        If the connection to the device is lost, the arm is released, and connecting is
-        attempted until the device is back.
+        If the connection to the device is lost, the arm is released and the connection is
+        retried until the device is back.
 
         Args:
-            stopped: Function that returns True to end the call.
+            stopped: Function that returns True to end the loop.
             say: Function that prints a line for the user.
         """
         is_present: bool | None = None  # None before the first attempt
@@ -301,5 +299,5 @@ class DeviceHand:
 
 
 def _compute_product(first: Sequence[float], second: Sequence[float]) -> float:
-    """Returns the scalar product of two vectors of equal length."""
+    """Returns the dot product of two vectors of equal length."""
     return sum(a * b for a, b in zip(first, second, strict=True))

@@ -1,10 +1,10 @@
-"""The commands `trilat experiment`: they write, check, run and analyse an experiment.
+"""The commands `trilat experiment`, which write, check, run and analyse experiments.
 
 In an experiment, people operate the arms under different conditions, such as two network
-delays. Models of people can replace them, to try out a protocol before anybody is invited.
+delays. Synthetic participants can take their place to try out a protocol in advance.
 
 Invariant:
-    - An interrupted experiment continues if the same command is entered again.
+    - An interrupted experiment resumes when the same command is run again.
 """
 
 from pathlib import Path

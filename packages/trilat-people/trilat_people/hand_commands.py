@@ -1,8 +1,8 @@
-"""The commands `trilat hand` and `trilat identify hand`, which concern the operators of an arm.
+"""The commands `trilat hand` and `trilat identify hand`.
 
-`trilat hand` connects an operator to an arm of a session. The operator is a program of the
-user, or a person with an input device such as a SpaceMouse. `trilat identify hand` estimates
-from a log the stiffness, damping and mass of the hand with which a person held an arm.
+`trilat hand` connects an operator to an arm of a session: either a user's program, or a person
+with an input device such as a SpaceMouse. `trilat identify hand` estimates the stiffness,
+damping and mass of a hand that held an arm from the log of the run.
 """
 
 from typing import Annotated

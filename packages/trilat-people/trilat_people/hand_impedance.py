@@ -1,20 +1,20 @@
-"""Identifies mass, damping and stiffness of a person's hand from the log of a run.
+"""Identifies the mass, damping and stiffness of a person's hand from the log of a run.
 
 While the person holds an arm, a simulated operator of the kind `multisine` excites the arms
-with a sum of sines. The force F of the hand on the arm and the position X of the end effector
-contain responses to the sines. At the angular frequency w of each sine, these responses satisfy
+with a sum of sines. At the angular frequency w of each sine, the force F of the hand on the arm
+and the position X of the end effector satisfy
 
     F(j w) = -(M (j w)^2 + B j w + K) X(j w)
 
-with the mass M, the damping B and the stiffness K of the hand, which are matrices over the axes
-of space. The person's voluntary movements do not follow the sines. Therefore the contribution
-of these movements vanishes in the mean over segments of the run. In the terms of system
+where M, B and K are the mass, damping and stiffness matrices of the hand, with one row and
+column per spatial axis. Voluntary movements of the person are not synchronised with the sines,
+so their contribution averages out over segments of the run. In the terms of system
 identification, the sines are an instrument. M, B and K are fitted by weighted least squares.
-Their confidence intervals come from the jackknife, which repeats the fit without one segment at
-a time.
+Their confidence intervals are computed with the jackknife, which repeats the fit omitting one
+segment at a time.
 
 Sources:
-    - Stiffness along several axes at once: E. J. Perreault, R. F. Kirsch, A. M. Acosta,
+    - Stiffness along several axes: E. J. Perreault, R. F. Kirsch, A. M. Acosta,
       "Multiple-input, multiple-output system identification for characterization of limb
       stiffness dynamics", Biological Cybernetics 80 (1999).
     - Sines in a closed loop: R. Pintelon, J. Schoukens, "System identification: a frequency
@@ -23,8 +23,8 @@ Sources:
       (1982).
 
 Invariant:
-    - F is the force, in N, with which the hand pushes the arm. The force of sines that act on
-      the same arm is not part of it.
+    - F is the force with which the hand pushes the arm, in N. It excludes the force of sines
+      that act on the same arm.
 """
 
 import json
@@ -40,12 +40,12 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from trilat_net.analysis import AlignedRecords, Complex, SourceRows, TorqueSplit
-from trilat_net.core import SCRIPTED_KINDS, Array
+from trilat_net.core import SCRIPTED_KINDS, Array, TorqueKind, TorqueSource
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.log import Log, open_log
 from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import Multisine, Scenario
+from trilat_net.scenario import Scenario
 
 MIN_SEGMENTS = 5
 """Smallest number of segments for confidence intervals."""
@@ -85,21 +85,22 @@ class _SineResponse(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class HandImpedance(Result):
-    """Identified mass, damping and stiffness of the hand that holds an arm.
+    """Identified mass, damping and stiffness of a hand that holds an arm.
 
-    The model of the hand is force = M acceleration + B velocity + K displacement. The entry in
-    a row and a column of a matrix is the force along the axis of the row per motion along the
-    axis of the column.
+    The model of the hand is force = M acceleration + B velocity + K displacement. Each matrix
+    entry is the force along the axis of its row per unit of motion along the axis of its
+    column.
 
     Attributes:
-        site: Site of the arm that the hand holds.
+        site: Name of the site whose arm the hand holds.
         M: Mass, force per acceleration, in kg, shape (n, n).
         B: Damping, force per velocity, in N s/m, shape (n, n).
         K: Stiffness, force per displacement, in N/m, shape (n, n).
-        halves: Half the width of the 95 % intervals of "M", "B" and "K", shape (n, n) each.
+        halves: Half-widths of the 95 % confidence intervals of "M", "B" and "K", each of shape
+            (n, n).
         segments: Number of segments of the run.
         segment_s: Duration of a segment, in s.
-        responses: Responses at the frequencies of the sines, in rising order.
+        responses: Responses at the frequencies of the sines, in ascending order.
     """
 
     site: str
@@ -112,10 +113,10 @@ class HandImpedance(Result):
     responses: tuple[_SineResponse, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the identified model of a person's hand to plain values for a JSON file.
+        """Converts the result to plain values, as read by `trilat linear --operators`.
 
-        The values are the matrices of mass, damping and stiffness, their confidence intervals
-        and the measured responses. The command `trilat linear --operators` reads the file.
+        Contains the mass, damping and stiffness matrices, their confidence intervals and the
+        measured responses.
         """
         return {
             "site": self.site,
@@ -132,19 +133,17 @@ class HandImpedance(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the hand's responses to forces, one row per frequency.
+        """Returns the measured responses of the hand as a table, with one row per frequency.
 
-        A row has the amplitudes of motion and force, their coherence, and the part of the force
-        that mass, damping and stiffness do not explain.
+        Each row contains the amplitudes of motion and force, their coherence, and the part of
+        the force that is not explained by mass, damping and stiffness.
         """
         return [response._asdict() for response in self.responses]
 
     def to_hand(self) -> dict[str, Any]:
-        """Returns the settings of the simulated operator that is most similar to this hand.
+        """Returns the scenario settings of the simulated operator most similar to this hand.
 
-        This operator consists of a spring and a damper along each axis, and has no mass. The
-        settings are the entries of its table in a scenario, the file that describes an
-        experiment.
+        The operator is a spring and a damper along each axis, with no mass.
         """
         return {
             "kind": "tip_spring",
@@ -153,11 +152,11 @@ class HandImpedance(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat identify hand` prints.
+        """Yields the parts of the report that `trilat identify hand` prints.
 
-        The parts are the mass, damping and stiffness matrices with their confidence intervals,
-        a table of the motion and force at each frequency of the excitation, and the settings of
-        the most similar simulated operator.
+        These are the mass, damping and stiffness matrices with their confidence intervals, a
+        table of motion and force at each excitation frequency, and the settings of the most
+        similar simulated operator.
         """
         segments = count_nouns(self.segments, "segment")
         yield f"hand at {self.site}: {segments} of {self.segment_s:g} s, intervals of 95 %"
@@ -218,24 +217,25 @@ def _round_diagonal(matrix: Array) -> list[float]:
 
 
 def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
-    """Identifies mass, damping and stiffness of the hand that holds an arm.
+    """Identifies the mass, damping and stiffness of the hand that holds an arm.
 
-    While the person holds the arm, a simulated operator must excite the arms with a sum of
-    sines (kind `multisine`). The command is `trilat identify hand`.
+    While the person holds the arm, a simulated operator of the kind `multisine` must excite the
+    arms with a sum of sines. Equivalent to the command `trilat identify hand`.
 
     >>> hand = tn.identify_hand("run.mcap", "m1")  # doctest: +SKIP
     >>> hand.K.diagonal(), hand.halves["K"].diagonal()  # doctest: +SKIP
 
     Args:
-        log: Log of the run, or its path.
-        site: Name of the arm that the hand holds.
+        log: Log of the run, or path of the log.
+        site: Name of the site whose arm the hand holds.
 
     Returns:
-        The matrices M, B and K. `halves` contains half the widths of their 95 % intervals.
+        The matrices M, B and K, and in `halves` the half-widths of their 95 % confidence
+        intervals.
 
     Raises:
-        UsageError: The run has no such arm or no sines, the run is too short, or the motion
-            along some axes is too similar to separate them.
+        UsageError: The run has no such site or no sines, is too short, or its motion along some
+            axes is too similar to separate them.
     """
     if not isinstance(log, Log):
         log = open_log(log)
@@ -346,9 +346,10 @@ def _find_sines(scenario: Scenario) -> _Sines:
         UsageError: No operator of the scenario is of the kind `multisine`. The error explains
             why the hand cannot be identified without it.
     """
-    multisines: list[Multisine] = []
+    multisines: list[TorqueSource] = []
     for site_settings in scenario.sites.values():
-        multisines += [hand for hand in site_settings.hands if isinstance(hand, Multisine)]
+        sources = [hand.actor for hand in site_settings.hands]
+        multisines += [source for source in sources if source.kind is TorqueKind.MULTISINE]
     if not multisines:
         raise UsageError(
             "no operator of kind 'multisine' in the scenario moves an arm, so the "
@@ -358,7 +359,8 @@ def _find_sines(scenario: Scenario) -> _Sines:
 
     frequencies_hz: list[float] = []
     for multisine in multisines:
-        frequencies_hz += map(float, multisine.frequencies_hz)
+        assert multisine.table is not None
+        frequencies_hz += multisine.table[:, 0].tolist()
     return _Sines(
         hz=np.unique(frequencies_hz),
         start_s=max(multisine.start_s for multisine in multisines),
@@ -613,19 +615,19 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
     smallest_deviation = 1e-6 * np.abs(mean_force).max()  # avoids a division by zero
 
     def compute_weighted_residuals(impedance: Array) -> Array:
-        """Computes the weighted difference between the measured force and the model's force.
+        """Returns the weighted difference between the measured force and the model's force.
 
-        At each frequency, the difference is averaged over the segments of the run, and divided
-        by its standard deviation over the segments. The forces and motions, and their means,
-        are those of the enclosing function.
+        At each frequency, the difference is averaged over the segments of the run and divided
+        by its standard deviation over the segments. Forces, motions and their means are taken
+        from the enclosing function.
 
         Args:
             impedance: Rows of the mass M, damping B and stiffness K for the axis of the force,
-                one after the other, shape (3 n,). n is the number of axes of the motion.
+                concatenated, shape (3 n,), where n is the number of axes of the motion.
 
         Returns:
-            The real parts, followed by the imaginary parts, shape (2 F,), for F frequencies.
-            They have no unit.
+            Dimensionless real parts, followed by the imaginary parts, shape (2 F,) for F
+            frequencies.
         """
         residuals = force - motions @ impedance  # in N, shape (segments, F)
         deviation_over_segments = residuals.std(axis=0)

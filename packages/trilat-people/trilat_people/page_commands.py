@@ -1,7 +1,7 @@
 """The commands `trilat live` and `trilat watch`, which show a running session to people.
 
-`trilat live` shows a web page on which people also take part: they move arms, stop them, and
-change settings. `trilat watch` shows a session in the terminal, or on such a page.
+`trilat live` serves a web page on which people can also take part: they move arms, stop them,
+and change settings. `trilat watch` shows a session in the terminal or on such a page.
 """
 
 from functools import partial

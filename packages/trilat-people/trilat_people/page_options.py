@@ -1,7 +1,7 @@
 """Command-line options for serving a web page: address, port, encryption and browser.
 
-Several commands show a running session on a web page. They share these options, so that an
-option has the same name and meaning in all of them.
+Shared by all commands that show a running session on a web page, so an option has the same name
+and meaning in each of them.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from trilat_net.app import value
 class PageServing(NamedTuple):
     """Options of a command that serves a web page: address, encryption, opening a browser.
 
-    `trilat live`, `trilat watch` and experiments with people share them.
+    Shared by `trilat live`, `trilat watch` and experiments with people.
     """
 
     host: Annotated[

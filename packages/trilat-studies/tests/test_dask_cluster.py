@@ -22,7 +22,7 @@ from trilat_net.errors import UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.work import dask_cluster
 from trilat_net.work.dask_cluster import WorkerRequirements, describe_worker
-from trilat_net.work.executor import open_worker_pool
+from trilat_net.work.executor import WorkerPool
 
 ROOT = Path(trilat_net.__file__).resolve().parents[1]
 
@@ -174,7 +174,7 @@ def test_workers_with_another_program_are_refused_even_later(
 
     first = cluster.add_worker()
     sources = describe_worker()["source files"]
-    with open_worker_pool(None, cluster.address) as pool:
+    with WorkerPool.open(None, cluster.address) as pool:
         assert pool.map(abs, [-1, -2]) == [1, 2]
         cluster.add_worker(tmp_path)
         until(lambda: count_workers(cluster) == 2, 60)
@@ -187,7 +187,7 @@ def test_workers_with_another_program_are_refused_even_later(
 
     with (
         pytest.raises(UsageError, match=f"source files .* {sources}"),
-        open_worker_pool(None, cluster.address),
+        WorkerPool.open(None, cluster.address),
     ):
         pass
 

@@ -1,9 +1,9 @@
-"""Compares many runs: parameter sweeps, tuning of gains, benchmarks, and training of policies.
+"""Studies that consist of many runs: sweeps, gain tuning, benchmarks and policy training.
 
-The package adds commands such as `trilat sweep`, and functions such as `trilat_net.sweep`. It
-is a distribution of its own, which registers them by the entry points of its pyproject.toml.
+This separate distribution adds commands such as `trilat sweep` and functions such as
+`trilat_net.sweep`. It registers them through the entry points in its pyproject.toml.
 
 Invariant:
-    - The result of a study depends only on its plan. The number of worker processes, and the
-      order in which they finish, have no influence.
+    - The result of a study depends only on its plan. The number of worker processes and the
+      order in which they finish have no influence.
 """

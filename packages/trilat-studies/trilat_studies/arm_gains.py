@@ -1,33 +1,34 @@
-"""Finds the largest gains with which equal arms can follow each other over a delay.
+"""Finds the largest gains with which identical arms can follow one another over a delay.
 
-The longer the delay, the smaller the gains with which the arms stay stable. `tune_arm` takes
-the model of an arm and a delay, and returns a stiffness K and dampings for each joint: d for
-the velocity and, for some control laws, Kd for the rate of the position error. One number k, in
-1/s^2, determines all of them:
+The longer the delay, the smaller the gains must be for the arms to remain stable. Given an arm
+model and a delay, `tune_arm` computes for each joint a stiffness K and damping gains: d for the
+velocity and, in some control laws, Kd for the rate of the position error. A single parameter k,
+in 1/s^2, determines all of them:
 
     K = k m,    d + Kd = 2 zeta sqrt(k) m,
 
-where zeta is the damping ratio. For m, the module uses the largest inertia of the joint about
-its own axis that occurs in a set of poses.
+where zeta is the damping ratio and m is the largest inertia of the joint about its own axis
+over a set of poses.
 
 Two limits bound the gains, and the result keeps a margin to both:
 
-- Stability with the delay: the edge is the least k at which small motions of the sampled
+- Stability under the delay: the edge is the smallest k at which small motions of the sampled
   control loop grow in one of the poses. The tuned stiffness is the stiffness at the edge
-  divided by the margin. Simulated runs check the edge.
-- Damping at the tick rate: a damping torque is constant during a control period (tick). If it
-  is too large, it reverses the velocity in every tick. This happens first in the direction in
-  which the arm has the least inertia. Where this limit requires it, m is chosen smaller.
+  divided by the margin. The edge is checked with simulated runs.
+- Damping at the tick rate: a damping torque stays constant for a whole tick, so excessive
+  damping reverses the velocity in every tick. This happens first in the direction in which the
+  arm has the least inertia. If this limit requires it, a smaller m is used.
 
-Sources for the edge of a single joint at a wall: J. J. Gil, A. Avello, A. Rubio and J. Florez,
-"Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE Trans.
-Control Systems Technology 12 (2004); over delays, T. Hulin, C. Preusche and G. Hirzinger,
-"Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
+For the stability edge of a single joint at a wall, see J. J. Gil, A. Avello, A. Rubio and J.
+Florez, "Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE
+Trans. Control Systems Technology 12 (2004); for the edge with delays, T. Hulin, C. Preusche and
+G. Hirzinger, "Stability boundary for haptic rendering: influence of physical damping", IROS
+2006.
 
 Invariant:
     - A result depends only on the arguments.
-    - Friction, joint stops and torque limits are left out. Friction only helps, and limits do
-      not act on small motions.
+    - Friction, joint stops and torque limits are ignored: friction only stabilises the loop,
+      and the limits do not affect small motions.
 """
 
 import math
@@ -41,7 +42,7 @@ import msgspec
 import numpy as np
 from scipy.optimize import brentq
 
-from trilat_net.analysis import EnvelopeTrend, RestingLoop, fit_envelopes
+from trilat_net.analysis import EnvelopeFit, EnvelopeTrend, RestingLoop
 from trilat_net.core import BUCKETS_PER_S, Array
 from trilat_net.errors import UsageError
 from trilat_net.execution import FusedRun
@@ -101,33 +102,34 @@ _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
 class ArmGains(Result):
     """The largest stable gains for an arm, reduced by a safety margin.
 
-    Two or three equal arms follow one another over links with a delay. The gains grow together
-    along a ray: the stiffness is K = k m for each joint, where m is the inertia of the joint
-    and k a common parameter in 1/s^2. The edge of stability is the k above which small motions
-    grow. `tune_arm` creates this object. The keys in JSON equal the attributes.
+    The gains are computed for two or three identical arms that follow one another over delayed
+    links. One parameter k, in 1/s^2, determines all gains: the stiffness of a joint is K = k m,
+    where m is the inertia of the joint. The edge of stability is the k above which small
+    motions grow. `tune_arm` creates this object. Its JSON keys are the attribute names.
 
     Attributes:
         arm: File name of the arm's URDF.
         law: Name of the control law.
         sites: Number of arms.
         rate_hz: Tick rate of the control loop, in Hz.
-        delay: Description of the delay of the links, in words.
-        age_ms: Constant age of samples that represents the delay, in ms.
-        margin: Factor by which the stiffness lies below the edge.
+        delay: Description of the link delay.
+        age_ms: Constant sample age that represents the delay, in ms.
+        margin: Ratio of the stiffness at the edge to the tuned stiffness.
         damping: Damping ratio of the gains.
         joints: For each joint, the inertia m, the gains with their unit, and the position error
-            at which the effort limit of the joint is reached.
-        edge: Values of k at the edge, in 1/s^2. There are three: of the sampled loop with the
-            delays in use, of the sampled loop with a constant delay, and in continuous time. A
-            value is `None` if there is no edge. Further entries are the smallest k at which the
-            damping makes a motion swing from tick to tick; the frequency, motion and pose at
-            the edge; and whether the delay or the tick rate limits K.
-        runs: Simulated runs that check the gains. The entry `share` is `None` for the run with
-            the gains themselves. For the other runs it is their k as a fraction of the k at the
-            edge. Each run has two growth rates. The first is measured from the largest speed,
-            and is `None` if the motions were not small. The second is predicted by the
-            characteristic roots of the linearised loop.
-        agree: True if all runs behave as the roots predict, and the run with the gains decays.
+            at which the joint reaches its effort limit.
+        edge: Values of k at the edge, in 1/s^2, for three models: the sampled loop with the
+            actual delays, the sampled loop with a constant delay, and the loop in continuous
+            time. A value is `None` if there is no edge. Further entries are the smallest k at
+            which the damping makes a motion oscillate from tick to tick; the frequency, motion
+            and pose at the edge; and whether the delay or the tick rate limits K.
+        runs: Simulated runs that check the gains. `share` is the k of the run as a fraction of
+            the k at the edge, or `None` for the run with the tuned gains. Each run has two
+            growth rates. The first is measured from the largest speed, and is `None` if the
+            motions were not small. The second is predicted from the characteristic roots of the
+            linearised loop.
+        agree: True if all runs behave as the roots predict and the motions decay with the tuned
+            gains.
         line: The gains as a line to paste above the tables of a scenario.
         curve: Pairs of a delay, in s, and k at the edge in the same pose. Empty unless
             requested.
@@ -149,18 +151,15 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table with a row per joint of the arm: its inertia and its control gains.
-
-        The table is written as a CSV file.
-        """
+        """Returns the inertia and the gains of each joint, as the rows of the CSV file."""
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that the command `trilat tune` prints.
+        """Yields the sections of the report that `trilat tune` prints.
 
-        The parts are a description of the control loop, a table of the joints and their gains,
-        the limit of stability, the simulated runs that check it, and a line with the gains. A
-        user can paste this line into a scenario, the file that describes an experiment.
+        The report describes the control loop, lists the gains of each joint, states the
+        stability limit, and shows the simulated runs that check this limit. It ends with the
+        gains as a line that can be pasted into a scenario.
         """
         yield (
             f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
@@ -508,20 +507,19 @@ class _GainSearch:
         return largest_ratio, lightest_motion**2
 
     def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
-        """Returns the control law with the gains that a gain parameter k determines.
+        """Creates the control law with the gains that correspond to a value of k.
 
-        A joint with the inertia m gets the following gains, where K is the stiffness, d the
-        damping of the velocity, Kd the damping of the velocity error, and zeta the damping
-        ratio:
+        For a joint with inertia m, the stiffness K, the velocity damping d and the error-rate
+        damping Kd satisfy
 
-            K = k m,    d + Kd = 2 zeta sqrt(k) m
+            K = k m,    d + Kd = 2 zeta sqrt(k) m,
 
-        The ratio of d and Kd is the same as in the default gains of the law. All gains are
-        rounded to four digits.
+        where zeta is the damping ratio. The ratio of d to Kd is that of the law's default
+        gains. All gains are rounded to four digits.
 
         Args:
             k: The gain parameter, in 1/s^2.
-            stiffness_divisor: Number by which K is divided. The damping stays the same.
+            stiffness_divisor: Divisor of K. The damping is not divided.
         """
         law: Any = self._scenario.controls[0]
         default_damping = {}
@@ -551,27 +549,27 @@ class _GainSearch:
         *,
         sampled: bool = True,
     ) -> tuple[float, Array]:
-        """Finds the least k at which small motions grow in one of several poses.
+        """Finds the smallest k over all poses at which small motions grow.
 
-        In each pose, k is raised from `start` until motions grow. Then the edge below that k is
-        located with Brent's method. A later pose is searched only if motions in this pose grow
-        just below the least edge so far.
+        In each pose, k is raised from `start` until motions grow, and the edge below that k is
+        then located with Brent's method. The search skips a pose if its motions still decay
+        just below the smallest edge found so far.
 
-        Under varying delays, motions may grow, decay and grow again as k rises. Therefore the
-        first steps of the search are small in this case.
+        With varying delays, motions may grow, decay and grow again as k increases, so the first
+        steps of the search are kept small in that case.
 
         Args:
             loop: The linearised loop of the arms.
             poses: The poses.
-            start: First k of the search, in 1/s^2.
+            start: Initial k of the search, in 1/s^2.
             sampled: True to analyse the sampled loop, False to analyse it in continuous time.
 
         Returns:
-            The least k, and the pose in which motions grow. k is infinite if motions grow in no
-            pose.
+            The smallest k, in 1/s^2, and the pose in which it occurs. k is infinite if motions
+            decay in every pose.
 
         Raises:
-            UsageError: In one of the poses motions grow even for tiny gains.
+            UsageError: Motions grow even with tiny gains in one of the poses.
         """
         least_edge = math.inf
         worst_pose = self._poses[0]
@@ -584,10 +582,10 @@ class _GainSearch:
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
-                """Returns the rate at which small motions about a pose grow, in 1/s.
+                """Returns the growth rate of small motions about a pose, in 1/s.
 
-                The rate depends on the gain k. A negative rate means that the motions decay,
-                and the control loop is stable.
+                The gains correspond to k = exp(log_k). The rate is negative if the motions
+                decay.
                 """
                 law = self.build_law(math.exp(log_k))
                 return loop.find_root(law, pose, sampled=sampled).s.real
@@ -612,14 +610,14 @@ class _GainSearch:
     def find_edge(self) -> dict[str, Any]:
         """Finds the largest gains with which small motions of the arms still decay.
 
-        The stiffness of each joint is K = k m, where m is the inertia of the joint. The edge of
-        stability is the least k, in 1/s^2, at which small motions grow. First, the pose with
-        the least edge is found with a constant delay. The edges with the varying delay and in
-        continuous time are then computed in this pose only.
+        The stiffness of each joint is K = k m, where m is its inertia, and the edge is the
+        smallest k, in 1/s^2, at which small motions grow. The pose with the smallest edge is
+        first found with a constant delay. The edges with the varying delay and in continuous
+        time are then computed for that pose only.
 
         Returns:
-            The edge values, as described for `ArmGains.edge`. The further entry `used_per_s2`
-            is the k of the tuned gains before the stiffness is divided by the margin.
+            The edge values described for `ArmGains.edge`, plus the entry `used_per_s2`: the k
+                of the tuned gains before the stiffness is divided by the margin.
         """
         constant, pose = self.find_least_edge(self.constant_loop, self._poses, self._least_k)
 
@@ -664,18 +662,17 @@ class _GainSearch:
         }
 
     def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
-        """Computes how the largest stable gains depend on the delay, for a figure.
+        """Computes the k at the edge, in 1/s^2, as a function of the delay, for a figure.
 
-        For each delay, the result is the least k at which small motions of the sampled control
-        loop grow, where the stiffness of each joint is k times its inertia. The delays are
-        whole numbers of ticks (control periods) on a geometric scale, from one tick up to four
-        times the delay of the loop, but at least up to eight ticks.
+        Each delay is a multiple of the tick. The delays are spaced geometrically from one tick
+        to four times the delay of the loop, or to eight ticks if that is longer.
 
         Args:
             pose: Pose of all arms, shape (n,), in rad or m, for n joints.
 
         Returns:
-            Pairs of a delay, in s, and the value of k, in 1/s^2.
+            Pairs of a delay, in s, and the smallest k, in 1/s^2, at which small motions of the
+            sampled loop grow.
         """
         longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
         geometric_ticks = np.geomspace(1.0, longest_ticks, _CURVE_POINTS)
@@ -694,24 +691,21 @@ class _GainSearch:
     def confirm(
         self, law: Any, share: float | None, pose: Array, push: Array
     ) -> dict[str, Any]:
-        """Simulates arms with given gains, to check whether small motions grow as predicted.
+        """Simulates arms with given gains to check whether small motions grow as predicted.
 
         The first arm starts slightly displaced from the pose of the others. The run lasts a few
-        time constants of the slowest motion. As long as it is not clear whether the motions
-        grow or decay, the duration is doubled, up to a limit.
+        time constants of the slowest motion. If the growth rate is still unclear, the duration
+        is doubled, up to a limit.
 
         Args:
             law: Control law with its gains.
-            share: The gains of `law` as a fraction of the largest stable gains: their parameter
-                k divided by the least k at which motions grow, where the stiffness is k times
-                the inertia. `None` for the tuned gains. The value is only copied into the
-                result.
+            share: k of the gains as a fraction of the k at the edge, or `None` for the tuned
+                gains. It is only copied into the result.
             pose: Pose of all arms, shape (n,), in rad or m, for n joints.
             push: Displacement of the first arm, shape (n,), in rad or m.
 
         Returns:
-            The run as an entry of `ArmGains.runs`, with the simulated and the predicted growth
-            rate.
+            An entry of `ArmGains.runs`, with the simulated and the predicted growth rate.
         """
         root = self.loop.find_root(law, pose)
         predicted_per_s = root.s.real
@@ -734,7 +728,7 @@ class _GainSearch:
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
             floor = _STILL * speed.max()
             speed_column = speed[:, np.newaxis]
-            fits = fit_envelopes(t_s, speed_column, floor, falls_first=True)
+            fits = EnvelopeFit.fit_columns(t_s, speed_column, floor, falls_first=True)
             fit = fits[0]
             diverged = run.diverged_s is not None
             if diverged or fit.trend in _IS_STABLE:
@@ -784,32 +778,32 @@ def tune_arm(
     curve: bool = False,
     progress: Progress = ignore_progress,
 ) -> ArmGains:
-    """Finds the largest gains with which equal arms follow one another stably over a delay.
+    """Finds the largest gains with which identical arms follow one another stably over a delay.
 
-    The command is `trilat tune`.
+    The command `trilat tune` does the same.
 
     >>> tuned = tn.tune_arm("arm6.urdf", "40ms", poses=2)
     >>> tuned.agree, len(tuned.joints)
     (True, 6)
 
     Args:
-        arm: Path of a URDF, or the name of a shipped file.
-        delay: Delay of each link: a text such as "40ms", a number of ms, a table with the
+        arm: Path of a URDF, or the name of one that ships with the program.
+        delay: Delay of each link: a string such as "40ms", a number of ms, a table with the
             columns t_s,delay_ms, or a log, as in "measured:run.mcap".
         law: Name of the control law: p_d, pd_d or saturated_pd.
-        set: Overrides of the loop, as in `{"arm.armature_kg_m2": 0.1}`.
-        tip: Name of the end link. If empty, the only link without a child is the end link.
+        set: Overrides for the loop, such as `{"arm.armature_kg_m2": 0.1}`.
+        tip: Name of the end link. May be empty if only one link has no child.
         sites: Number of arms: 2, or 3 that follow their two peers equally.
         rate_hz: Tick rate, in Hz.
-        margin: Factor by which K lies below the edge, and the damping below its sampled-data
-            limit.
-        damping: Damping ratio of the inertia m when its peer stands still.
-        quantile: Quantile of varying delays for which the edge of a constant delay is computed.
-        poses: Number of random poses within the limits of the joints.
-        seed: Seed of the poses.
+        margin: Safety factor by which K is kept below the edge, and the damping below its
+            sampled-data limit.
+        damping: Damping ratio of an arm with inertia m whose peer is at rest.
+        quantile: With varying delays, the quantile that is used as the constant delay.
+        poses: Number of random poses within the joint limits.
+        seed: Random seed of the poses.
         curve: True to compute the edge as a function of the delay too, for a figure.
-        progress: Function that is called with the number of finished steps and of all steps.
-            The steps are the edge and each run.
+        progress: Called with the number of completed steps and the total number of steps. The
+            steps are the search for the edge and each simulated run.
 
     Raises:
         ScenarioError: The URDF, its tip or an override is not valid.

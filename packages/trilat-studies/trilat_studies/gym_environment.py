@@ -1,7 +1,8 @@
-"""Makes Gymnasium environments, in which a policy is trained to operate an arm.
+"""Creates Gymnasium environments for training a policy to operate an arm.
 
-Gymnasium is a common interface of reinforcement learning. `make_env` returns one environment,
-or with `num_envs` several that are simulated together, which is faster.
+Gymnasium is a standard interface for reinforcement learning. `make_env` returns a single
+environment or, with `num_envs`, several environments that are simulated together, which is
+faster.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +57,7 @@ def make_env(
     autoreset_mode: str = "NextStep",
     **settings: Any,
 ) -> TeleoperationEnv | TeleoperationVectorEnv:
-    """Makes an environment in which a policy operates one arm, or several environments.
+    """Creates an environment in which a policy operates one arm, or several such environments.
 
     See docs/studies/train-policies.md.
 
@@ -66,8 +67,8 @@ def make_env(
     >>> observation["peer_q"].shape
     (1, 2)
 
-    Several environments advance side by side on one core. Each gives the same bits as if it
-    were alone:
+    Several environments are stepped side by side on one core. The results of each are identical
+    to the last bit to those of a single environment:
 
     >>> envs = tn.make_env("two_sites", bent, user="m", duration_s=1, num_envs=8)
     >>> observations, infos = envs.reset(seed=1)  # the seeds 1 to 8
@@ -75,16 +76,18 @@ def make_env(
     (8, 1, 2)
 
     Args:
-        scenario: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        set: Overrides, as in `{"link.delay_ms": 100}`.
-        num_envs: Number of environments that advance together, as one environment of the class
-            `gymnasium.vector.VectorEnv`. If `None`, a single environment is returned. If the
-            environments cannot be computed side by side, they are stepped one by one, and the
-            attribute `obstacle` states the reason. Each environment has a copy of the task.
-        autoreset_mode: When the next episode of an environment begins: "NextStep" after an
-            episode has ended, "SameStep" at its end, or "Disabled".
-        **settings: The arguments that follow, by their names.
-        user: Site whose arm the actions move.
+        scenario: Name of a shipped scenario, a path, a TOML string, its tables, or a
+            `Scenario`.
+        set: Overrides, such as `{"link.delay_ms": 100}`.
+        num_envs: Number of environments that are stepped together, as one
+            `gymnasium.vector.VectorEnv`. If `None`, a single environment is returned.
+            Environments that cannot be computed side by side are stepped one by one, and the
+            attribute `obstacle` states the reason. Each environment has its own copy of the
+            task.
+        autoreset_mode: When the next episode of an environment begins: "NextStep" (in the step
+            after an episode ends), "SameStep" (in the step that ends it), or "Disabled".
+        **settings: The following arguments, as keyword arguments.
+        user: Site whose arm is moved by the actions.
         mode: Meaning of an action, "tip", "joint" or "force", as for a live operator. If empty,
             the mode of the scenario is kept.
         rate_hz: Number of steps per second.
@@ -93,22 +96,22 @@ def make_env(
             kept.
         task: Task of the episodes. By default, the site `leads` must bring its end effector to
             a random position.
-        vary: Keys of the scenario that each episode draws at random. A tuple of two numbers is
-            a pair of bounds, `(0, 300)`; a list has the possible values, `[0, 300]`.
-        leads: Site that does the task.
-        render_mode: With "rgb_array", `render` returns a picture of the arms and the goal. With
+        vary: Scenario keys that are drawn at random for each episode. A tuple of two numbers is
+            a pair of bounds, such as `(0, 300)`; a list contains the possible values, such as
+            `[0, 300]`.
+        leads: Site that performs the task.
+        render_mode: With "rgb_array", `render` returns an image of the arms and the goal. With
             `None`, `render` returns `None`.
-        flat: True if observations are one array of float32 instead of a dictionary, and actions
-            are float32.
-        normalize: True if actions and observations are numbers in [-1, 1]. An action of 1 is
-            then the largest target or force. Observations are divided by
-            `observation_scales`, and numbers beyond these scales are clipped.
+        flat: True if observations are a single float32 array instead of a dictionary, and
+            actions are float32.
+        normalize: True if actions and observations are scaled to [-1, 1]. An action of 1 is
+            then the largest target or force. Observations are divided by `observation_scales`
+            and clipped.
 
     Raises:
         ScenarioError: The scenario or an override is not valid.
-        UsageError: There is no such site, the rate is not valid, or Gymnasium is missing. The
-            same error is raised if another argument has an invalid value, which the message
-            names.
+        UsageError: There is no such site, the rate is not valid, Gymnasium is missing, or
+            another argument has an invalid value, which the message names.
     """
     env = TeleoperationEnv(scenario, set, **settings)
     if num_envs is None:

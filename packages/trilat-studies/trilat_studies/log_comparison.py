@@ -1,6 +1,4 @@
-"""Compares recorded runs: differences between their experiments, their metrics, and remarks.
-
-A log is the record of a run. Its scenario, the description of the experiment, is stored in it.
+"""Compares logs of runs: differences between their scenarios, their metrics, and remarks.
 
 Invariant:
     - The comparison states measured values and does not rank the runs.
@@ -23,7 +21,7 @@ from trilat_net.presentation import (
     format_number,
 )
 from trilat_net.results import Result
-from trilat_net.scenario import ScenarioDifference, compare_scenarios, reseed_scenario
+from trilat_net.scenario import ScenarioDifference, load_scenario
 from trilat_net.work import MeanInterval
 
 from .tuning.candidate import check_final_posture
@@ -74,24 +72,23 @@ class _ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """Value of one quantity in each of the compared logs. `None` if a log lacks it."""
+        """Value of the quantity in each of the compared logs. `None` where it is missing."""
         return tuple(entry.value for entry in self.entries)
 
 
 class MetricComparison(NamedTuple):
-    """Measured quantities of several runs side by side, as a table.
+    """Metrics of several runs side by side, as a table.
 
     Attributes:
         columns: Names of the runs.
-        rows: All quantities that apply to at least one of the runs, in the order in which they
-            are shown.
+        rows: All quantities that apply to at least one of the runs, in display order.
     """
 
     columns: tuple[str, ...]
     rows: tuple[_ComparisonRow, ...]
 
     def row(self, key: str) -> _ComparisonRow:
-        """Returns one quantity, such as a mean error, in all compared logs.
+        """Looks up one quantity, such as a mean error, in all compared logs.
 
         Args:
             key: Key of the quantity, such as "sharing_off".
@@ -104,11 +101,11 @@ class MetricComparison(NamedTuple):
 
     @classmethod
     def of_logs(cls, logs: Sequence[Log], names: Sequence[str] = ()) -> "MetricComparison":
-        """Computes the same quantities from several logs, to show them in one table.
+        """Computes the same quantities from several logs for one table.
 
         Args:
             logs: The logs, which may be torn, short or empty.
-            names: Names of the columns. By default the names of the logs' files.
+            names: Names of the columns. Default: the file names of the logs.
 
         Raises:
             LogError: A record cannot be read, or names a change that is not valid.
@@ -125,9 +122,9 @@ class MetricComparison(NamedTuple):
         return cls(tuple(columns), tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns a comparison of runs as plain values, ready for JSON.
+        """Converts the comparison to plain values for JSON.
 
-        A missing value is `None`, with the reason next to it.
+        A missing value is `None`, next to the reason why it is missing.
         """
         rows = []
         for row in self.rows:
@@ -146,7 +143,7 @@ class MetricComparison(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
-    """Differences between several logs in measured quantities and in settings.
+    """Differences between several logs, in their metrics and in their scenarios.
 
     `compare` creates this object.
 
@@ -154,9 +151,8 @@ class LogComparison(Result):
         logs: The logs.
         metrics: The metrics, with one row per quantity and one column per log.
         differences: Differences between the scenarios. Empty if all scenarios are the same.
-        means: Mean of each row, if the logs differ only in the seeds of their random numbers.
-            Empty otherwise.
-        remarks: For each column, the judgement of the run and remarks on its end.
+        means: Mean of each row, if the logs differ only in their random seeds. Empty otherwise.
+        remarks: For each column, the verdict on the run and remarks on its end.
     """
 
     logs: tuple[Log, ...]
@@ -179,10 +175,10 @@ class LogComparison(Result):
         return f"{', '.join(self.metrics.columns)}: {quantities}"
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat compare` prints.
+        """Yields the sections of the full report that `trilat compare --all` prints.
 
-        The parts are the differences between the experiments, a table of the metrics, notes on
-        how each run ended, and reasons for missing values.
+        The report lists the differences between the scenarios, a table of all metrics, notes on
+        how each run ended, and the reasons for missing values.
         """
         yield from self._compose_differences()
         yield ""
@@ -199,10 +195,10 @@ class LogComparison(Result):
             yield f"and {hidden} more, which --json names"
 
     def brief_blocks(self) -> Iterator[Block]:
-        """Yields the short text that `trilat compare` prints without --all.
+        """Yields the sections of the short report that `trilat compare` prints without --all.
 
-        The parts are the differences between the experiments, the judgement of each run, a
-        table of the metrics that differ most, and a summary in one sentence.
+        The report lists the differences between the scenarios, the verdict on each run, the
+        metrics that differ most, and a one-sentence summary.
         """
         yield from self._compose_differences()
         yield ""
@@ -309,7 +305,7 @@ class LogComparison(Result):
                     yield f"{name}: no {row.quantity.name}: {entry.why}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the comparison of logs to plain values for `trilat compare --json`."""
+        """Converts the comparison to plain values for `trilat compare --json`."""
         logs = []
         for name, log in zip(self.metrics.columns, self.logs, strict=True):
             entry = {
@@ -335,10 +331,7 @@ class LogComparison(Result):
         return comparison
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the metrics as a table of plain values, one row per quantity.
-
-        A row has the value of each log under the name of the log's column.
-        """
+        """Returns one row per metric, with the value of each log keyed by its column name."""
         rows = []
         for row in self.metrics.rows:
             quantity = row.quantity
@@ -349,9 +342,9 @@ class LogComparison(Result):
 
 
 def compare(*logs: str | Path | Log) -> LogComparison:
-    """Compares the metrics of logs, and the scenarios from which the logs come.
+    """Compares logs by their metrics and by the scenarios they were recorded from.
 
-    The command is `trilat compare`.
+    The command `trilat compare` does the same.
 
     >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
     >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
@@ -385,7 +378,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     return LogComparison(
         logs=tuple(opened),
         metrics=metrics,
-        differences=list(compare_scenarios(scenarios)),
+        differences=ScenarioDifference.list_between(scenarios),
         means=_average_repeats(opened, metrics),
         remarks=remarks,
     )
@@ -433,7 +426,7 @@ def _select_most_different(
             differences[index] = _measure_difference(row)
 
     def rank(index: int) -> tuple[bool, float, int]:
-        """Returns the sort key of a table row: `shown_keys` first, then by difference."""
+        """Returns a sort key that puts `shown_keys` first, then the largest differences."""
         return rows[index].quantity.key not in shown_keys, -differences[index], index
 
     ranked_rows = sorted(differences, key=rank)
@@ -479,7 +472,7 @@ def _average_repeats(
     seeds = {log.scenario.seed for log in logs}
     if len(seeds) < len(logs):
         return []
-    if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
+    if any(load_scenario(log.scenario, seed=first.seed) != first for log in logs):
         return []
     return [MeanInterval.of_values(row.values) for row in metrics.rows]
 

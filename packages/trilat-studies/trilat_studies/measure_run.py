@@ -1,17 +1,16 @@
-"""Measures a run, such as its largest error, and compares the results with the expected limits.
+"""Measures a run, for example its largest error, and checks the result against expectations.
 
-A scenario, the file that describes an experiment, may contain a table [expect] with
-requirements on its runs. For example, `peak_error_max_rad` limits the largest error. This
-module computes the metrics that the table can limit, from a simulation or from the log of a
-run.
+A scenario may contain a table [expect] with limits on its runs. For example,
+`peak_error_max_rad` limits the largest error. This module computes the metrics that the table
+can limit, from a simulation or from a log.
 
 Invariant:
-    - Each metric has one definition. Both a simulation and a log pass their records, batch by
-      batch in the order of time, to the same running statistics (`SiteStats`).
-    - A metric that cannot be computed for a run is `None`, and never a guess.
-    - Memory is bounded, however long the run is. Only extrema, sums, the last second of the
+    - Each metric has one definition. Simulations and logs pass their records in batches, in
+      chronological order, to the same running statistics (`SiteStats`).
+    - A metric that cannot be computed for a run is `None`, never a guess.
+    - Memory use is bounded, however long the run is. Only extrema, sums, the last second of
       records, and a summary of the motion are kept.
-    - The division of a run into batches changes only the last bits of a mean.
+    - How a run is divided into batches affects only the last bits of a mean.
 """
 
 import math
@@ -59,12 +58,11 @@ _VECTORS = ("q", "qd", "q_des", "tau", "tau_x", "x")
 
 
 class RecordBatch(NamedTuple):
-    """Results of consecutive ticks of one arm, as one array per quantity.
+    """Records of consecutive ticks of one arm, with one array per quantity.
 
-    Metrics are computed from such batches, because statistics are computed much faster from
-    arrays than from single records. K is the number of records, n the number of joints, m the
-    number of coordinates that the sites agree on, and P the number of peers, the other sites
-    whose states this site receives.
+    Metrics are computed from batches because statistics over arrays are much faster than over
+    individual records. In the shapes below, K is the number of records, n the number of joints,
+    m the number of coordinates that the sites agree on, and P the number of peers.
 
     Attributes:
         t_ns: Nominal times, shape (K,), in ns.
@@ -74,8 +72,8 @@ class RecordBatch(NamedTuple):
             task space.
         tau: Control torque, shape (K, n), in N m.
         tau_x: Exogenous torque with the sign of Eq. (8), shape (K, n), in N m.
-        used: Tick in which each peer sent the sample that is in use, shape (K, P). It is -1
-            before the first sample.
+        used: Tick in which each peer sent the sample in use, shape (K, P). -1 before the first
+            sample.
     """
 
     t_ns: Ints
@@ -87,37 +85,37 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records of ticks (control periods) later than a given time.
+        """Returns the records after a given time, which is itself excluded.
 
         Args:
-            t_ns: The time, in ns. A record at exactly this time is not returned.
+            t_ns: The time, in ns.
         """
         first = int(np.searchsorted(self.t_ns, t_ns, side="right"))
         return self.slice(first, None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records of control periods from one time up to another.
+        """Returns the records within a time interval.
 
         Args:
-            from_ns: Start of the interval, in ns, which belongs to the interval.
-            to_ns: End of the interval, in ns, which does not belong to it.
+            from_ns: Start of the interval, in ns, inclusive.
+            to_ns: End of the interval, in ns, exclusive.
         """
         first = int(np.searchsorted(self.t_ns, from_ns))
         stop = int(np.searchsorted(self.t_ns, to_ns))
         return self.slice(first, stop)
 
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
-        """Adds these records to a compact summary, from which the end of a run is judged.
+        """Adds these records to a compact summary, which is used to judge the end of the run.
 
-        The summary divides the time of the run into intervals, called buckets, and keeps only a
-        few extreme values of each. A long run can thus be judged without keeping its records.
+        The summary divides the time axis into buckets and stores only a few extreme values for
+        each, so a long run can be judged without keeping all of its records.
 
         Args:
-            into: Summary of all earlier records, which may be changed in place. By default
+            into: Summary of all earlier records, which may be modified in place. By default
                 there are no earlier records.
 
         Returns:
-            The summary that includes these records, see `RunTrace.reduce_records`.
+            The updated summary, see `RunTrace.reduce_records`.
         """
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
         return RunTrace.reduce_records(
@@ -129,21 +127,21 @@ class RecordBatch(NamedTuple):
         )
 
     def slice(self, first: int, stop: int | None) -> "RecordBatch":
-        """Returns the records with the indices from `first` up to, but not including, `stop`.
+        """Returns the records with indices from `first` up to, but not including, `stop`.
 
         Args:
             first: First index.
-            stop: End of the range. If `None`, all following records are returned.
+            stop: End of the range. If `None`, all remaining records are returned.
         """
         columns = [column[first:stop] for column in self]
         return RecordBatch._make(columns)
 
     @classmethod
     def join(cls, batches: "Sequence[RecordBatch]") -> "RecordBatch":
-        """Joins consecutive batches of records of one arm into a single batch.
+        """Concatenates consecutive batches of one arm into a single batch.
 
         Args:
-            batches: Batches in the order of time, at least one.
+            batches: Batches in chronological order, at least one.
         """
         columns = []
         for parts in zip(*batches, strict=True):
@@ -182,17 +180,16 @@ def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array)
 def run_in_batches(
     scenario: Scenario, receivers: Mapping[str, Callable[[RecordBatch], None]]
 ) -> tuple[float | None, int]:
-    """Runs a scenario in virtual time, and passes the records on batch by batch.
+    """Runs a scenario in virtual time and passes its records to the receivers in batches.
 
-    Long runs thus need little memory. Virtual time means that a simulated clock replaces the
-    real clock.
+    Since records are not kept, long runs need little memory.
 
     Args:
-        scenario: Scenario to run: arms, control laws, links and duration.
+        scenario: Scenario to run.
         receivers: For each site, the function that receives its batches.
 
     Returns:
-        The time at which the first site left the limits of its arm, in s, or `None` if no site
+        The time at which the first site left the limits of its arm, in s, or `None` if none
         did; and the number of samples that arrived too late to be used as planned.
     """
     pending: dict[str, list[TickRecord]] = {name: [] for name in receivers}
@@ -200,10 +197,9 @@ def run_in_batches(
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
-        """Passes the collected records of an arm on as arrays, and begins a new collection.
+        """Passes the collected records of a site on as arrays and clears the collection.
 
-        Statistics over arrays are much faster than record by record. Nothing happens if no
-        records were collected.
+        Does nothing if no records were collected.
 
         Args:
             name: Name of the site.
@@ -250,13 +246,13 @@ def run_in_batches(
 def run_compiled_in_batches(
     scenario: Scenario, receivers: Mapping[str, Callable[[RecordBatch], None]]
 ) -> FusedRun:
-    """Runs a scenario in the compiled loop, and passes the records on batch by batch.
+    """Runs a scenario in the compiled loop and passes its records to the receivers in batches.
 
-    The compiled loop executes all sites without returning to Python, and is therefore much
-    faster than `run_in_batches`.
+    The compiled loop runs the controllers of all sites without returning to Python, which makes
+    it much faster than `run_in_batches`.
 
     Args:
-        scenario: Scenario to run: arms, control laws, links and duration.
+        scenario: Scenario to run.
         receivers: For each site, the function that receives its batches.
 
     Returns:
@@ -288,12 +284,12 @@ class _CompiledRun:
         self._axes = {name: arm.axes for name, arm in scenario.arms.items()}
 
     def finish(self) -> None:
-        """Simulates the run to its end, and passes its records on."""
+        """Simulates the run to its end and passes on its records."""
         for batch in self.run.iterate_batches():
             self.pass_records(batch)
 
     def pass_records(self, batch: Sequence[tuple[Ints, Array]]) -> None:
-        """Passes records on to the functions that evaluate the arms.
+        """Passes the records of each site to its receiver.
 
         Args:
             batch: The latest records of each site, see `FusedRun.pop_records`.
@@ -315,12 +311,12 @@ class _CompiledRun:
 
 
 class WholeRun(NamedTuple):
-    """A simulated run with all of its records in memory, for metrics of the whole run.
+    """A simulated run with all of its records in memory.
 
     Attributes:
         records: Records of each site, by its name.
-        end: Judgement of the end of the run, for example whether the arms came to rest.
-        run: The run itself, which contains its final state.
+        end: Analysis of the end of the run, for example whether the arms came to rest.
+        run: The simulation, which contains the final state.
     """
 
     records: dict[str, RecordBatch]
@@ -329,12 +325,12 @@ class WholeRun(NamedTuple):
 
     @classmethod
     def simulate(cls, scenario: Scenario) -> "WholeRun":
-        """Simulates a scenario by compiled code, and keeps all records in memory.
+        """Simulates a scenario in the compiled loop and keeps all records in memory.
 
-        Measures of the whole run, such as an impedance, need all records at once.
+        This is needed for quantities such as an impedance, which cannot be computed in batches.
 
         Args:
-            scenario: Scenario to run: arms, control laws, links and duration.
+            scenario: Scenario to run.
         """
         batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
         receivers = {name: batches[name].append for name in batches}
@@ -346,18 +342,19 @@ class WholeRun(NamedTuple):
         cls,
         scenarios: Sequence[Scenario],
     ) -> "Iterator[tuple[int, WholeRun, str]]":
-        """Simulates several scenarios, as many as possible at once, and keeps their records.
+        """Simulates several scenarios, as many at once as possible, and keeps their records.
 
-        Scenarios that differ only in numbers are computed together with vector instructions.
-        Each run equals that of `simulate` bit for bit.
+        Scenarios that have the same structure and differ only in numerical parameters are
+        computed together with vector instructions. Each run is identical to that of `simulate`,
+        bit for bit.
 
         Args:
             scenarios: The scenarios.
 
         Yields:
-            The index of a scenario; its run, equal to that of `simulate`; and the property
-            because of which it was computed alone, or an empty text. The runs are in the order
-            of their groups, of which one at a time is in memory.
+            The index of a scenario, its run, and the reason why it was computed alone (an empty
+            string if it was not). Runs are ordered by group, and only one group is in memory at
+            a time.
         """
         batches: list[dict[str, list[RecordBatch]]] = []
         compiled = []
@@ -425,9 +422,9 @@ def _join_run(
 
 
 class Range(NamedTuple):
-    """Smallest and largest value of a quantity in a part of the run, to compare with limits.
+    """Smallest and largest value of a quantity in part of a run, for comparison with limits.
 
-    A quantity with a single value, such as a mean, has this value as both ends.
+    For a single-valued quantity, such as a mean, both ends are the same.
     """
 
     least: float
@@ -435,16 +432,16 @@ class Range(NamedTuple):
 
 
 class WindowStats:
-    """Statistics of one arm in a part of the run, for which the scenario states limits.
+    """Statistics of one arm over a window, a part of the run with limits of its own.
 
-    Such a part is called a window in the table [expect] of the scenario. The statistics are
-    updated batch by batch, so the records need not be kept.
+    Windows are defined in the table [expect] of the scenario. The statistics are updated batch
+    by batch, so records need not be kept.
 
     Args:
-        from_s: Start of the part of the run, in s.
-        to_s: End of the part of the run, in s.
+        from_s: Start of the window, in s.
+        to_s: End of the window, in s.
         scenario: Scenario of the run.
-        site: Name of the site whose records are evaluated.
+        site: Name of the site to evaluate.
     """
 
     def __init__(self, from_s: float, to_s: float, scenario: Scenario, site: str) -> None:
@@ -472,12 +469,12 @@ class WindowStats:
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the statistics of a time interval with the next records of an arm.
+        """Updates the statistics with the next records of the arm.
 
-        Records outside of the interval are ignored.
+        Records outside the window are ignored.
 
         Args:
-            rows: The records, at least one. They must follow the records of the previous call.
+            rows: The records, at least one. They must follow those of the previous call.
         """
         self._last_ns = int(rows.t_ns[-1])
         rows_inside = rows.between(self._from_ns, self._to_ns)
@@ -537,15 +534,14 @@ class WindowStats:
         self._force_peak = max(self._force_peak, peak)
 
     def compute_ranges(self) -> dict[str, Range]:
-        """Returns the smallest and the largest value of each quantity in this interval of time.
+        """Returns the smallest and largest value of each quantity within the window.
 
-        A scenario can limit quantities in intervals of the run, which it calls windows of its
-        table [expect]. Joint angles have a smallest and a largest value. All other quantities,
-        such as a mean or a peak, have a single value, which is used as both.
+        Joint angles have distinct extremes. All other quantities, such as a mean or a peak,
+        have a single value, which is used as both ends of the range.
 
         Returns:
-            The ranges, by the keys of the table [expect]. Empty if the records end before the
-            interval does.
+            The ranges, keyed as in the table [expect]. Empty if the records end before the
+            window does.
         """
         ends_early = self._last_ns < self._to_ns - self._period_ns
         if not self._records or ends_early:
@@ -583,15 +579,14 @@ _END_NS = round(END_WINDOW_S * NS_PER_S)
 
 
 class SiteStats:
-    """Statistics of one site over a run, which are updated batch by batch.
+    """Running statistics of one site, updated batch by batch.
 
-    The metrics of the run are computed from the statistics of all sites. Therefore no records
-    need to be kept. Below, e is the error of the site against its reference, and |e| its
-    magnitude.
+    The metrics of a run are computed from the statistics of all sites, so records need not be
+    kept. Below, e is the error of the site against its reference, and |e| its magnitude.
 
     Args:
         scenario: Scenario of the run.
-        site: Name of the site whose records are evaluated.
+        site: Name of the site to evaluate.
 
     Attributes:
         windows: Statistics within each window of [expect]. `None` for windows of other sites.
@@ -600,7 +595,7 @@ class SiteStats:
         peak_torque_nm: Largest absolute control torque of any joint, in N m.
         peak_speed_rad_s: Largest absolute velocity of any joint, in rad/s.
         unsynchronised_ns: Time of the last record in which |e| was not below the limit
-            `synchronised_rad` of [expect], in ns. It is -1 before the first such record.
+            `synchronised_rad` of [expect], in ns. -1 if there is no such record yet.
         age_max_ms: Largest age of each peer's sample in use, shape (P,), in ms.
     """
 
@@ -640,8 +635,7 @@ class SiteStats:
         """Updates the errors, torques, sample ages and other statistics with further records.
 
         Args:
-            rows: The next records of the arm. They must follow the records of the previous
-                call.
+            rows: The next records of the arm. They must follow those of the previous call.
         """
         if not len(rows.t_ns):
             return
@@ -699,10 +693,7 @@ class SiteStats:
 
     @property
     def last_ns(self) -> int:
-        """Nominal time of the last record, in ns since the epoch. It is -1 before any record.
-
-        The last second and the duration of the run are computed from this time.
-        """
+        """Nominal time of the last record, in ns since the epoch. -1 if there is none yet."""
         if not self._tail:
             return -1
         last_batch = self._tail[-1]
@@ -710,20 +701,14 @@ class SiteStats:
 
     @property
     def rms_error_rad(self) -> float:
-        """Root mean square of the error e over all records, in rad.
-
-        It is computed for each joint, and the largest of these values is returned.
-        """
+        """Root mean square of the error e over all records, in rad, of the worst joint."""
         records = max(1, self.records)
         mean_square = self._squares.max() / records
         return float(np.sqrt(mean_square))
 
     @property
     def link_ages(self) -> list["LinkAge"]:
-        """Ages of the samples in use, one entry per peer, in the order of the peers.
-
-        A peer is another site whose samples (published states) this site receives.
-        """
+        """Ages of the samples in use, with one entry per peer in the order of the peers."""
         sums_ms = self._age_sum_ms.tolist()
         record_counts = self._age_records.tolist()
         largest_ms = self.age_max_ms.tolist()
@@ -740,11 +725,9 @@ class SiteStats:
     def end(self, end_ns: int) -> RecordBatch:
         """Returns the records of the last second of the run, for the metrics `end_...`.
 
-        A metric such as the error at rest is evaluated in the last second.
-
         Args:
-            end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
-                than others, fewer records are returned.
+            end_ns: Time of the run's last record, in ns. Fewer records are returned if the
+                records of this arm end earlier than those of others.
         """
         rows = RecordBatch.join(self._tail)
         start_ns = end_ns - _END_NS
@@ -752,19 +735,19 @@ class SiteStats:
 
     @property
     def buckets(self) -> Array:
-        """Summary of the motion of an arm, by which the end of the run is judged.
+        """Summary of the arm's motion, used to judge the end of the run.
 
-        A row has the extreme values of a short interval of time, see `RecordBatch.reduce`.
+        Each row contains the extreme values of a short time interval, see `RecordBatch.reduce`.
         """
         last_bucket = self.last_ns // _BUCKET_NS
         return self._buckets[: last_bucket + 1]
 
     @property
     def tau_x(self) -> Array:
-        """External torque of operator and environment in the last record, in N m, shape (n,).
+        """Torque of operator and environment in the last record, in N m, shape (n,).
 
         It shows whether an operator still acts on the arm when the run ends. Before the first
-        record it is a single zero.
+        record, the array is a single zero.
         """
         if not self._tail:
             return np.zeros(1)
@@ -774,10 +757,10 @@ class SiteStats:
 
 
 class LinkAge(msgspec.Struct, frozen=True):
-    """Age of the samples in use of one link, which leads from one site to another.
+    """Age of the samples in use on one link.
 
-    A sample is the state that a site sends in a tick. The age of the sample is the time since
-    that tick. Ticks before the first sample do not count.
+    The age is the time since the tick in which the sample was sent. Ticks before the first
+    sample are not counted.
 
     Attributes:
         mean_ms: Mean age, in ms. `None` if the link never delivered a sample.
@@ -789,19 +772,18 @@ class LinkAge(msgspec.Struct, frozen=True):
 
 
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """Metrics of one run, which are compared with the expectations of its scenario.
+    """Metrics of one run, for comparison with the expectations of its scenario.
 
-    The docstring of `Expect` defines each metric. A metric is `None` if it cannot be computed,
-    because the run is too short or because an event did not happen. The metrics `end_...`
-    concern the last second of the run. A link "j->i" leads from site j to site i.
+    The docstring of `Expect` defines each metric. A metric is `None` if it cannot be computed
+    because the run is too short or an event did not happen. The metrics `end_...` describe the
+    last second of the run. A link "j->i" leads from site j to site i.
 
     Attributes:
         simulated_s: Duration of the run in its own time, in s.
-        end: Judgement of the end of the run, for example whether the arms came to rest.
-        ages: Ages of the samples in use (the states that a site received from a peer), by link
-            "j->i".
+        end: Analysis of the end of the run, for example whether the arms came to rest.
+        ages: Ages of the samples in use, by link "j->i".
         late_samples: Number of samples that arrived after the time at which they were due.
-        missing: Number of ticks (control periods) without a record, over all sites.
+        missing: Number of ticks without a record, over all sites.
         windows: Ranges of the quantities within each window, a part of the run with limits of
             its own. Empty for a window that ends after the run.
         metrics: Those metrics of `docs/reference/metrics.md` for which the scenario states a
@@ -826,14 +808,14 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of_virtual_run(cls, scenario: Scenario) -> "RunMetrics":
-        """Runs a scenario in virtual time and returns the metrics of the run.
+        """Runs a scenario in virtual time and measures the run.
 
-        The records are discarded as soon as their statistics are known, so long runs need
-        little memory. All records are kept only if the scenario limits a metric of
-        `docs/reference/metrics.md`, because these metrics are computed from a complete log.
+        Records are discarded as soon as they have been added to the statistics, so long runs
+        need little memory. The exception is a scenario that limits a metric of
+        `docs/reference/metrics.md`, since these metrics require a complete log.
 
         Args:
-            scenario: Scenario to run: arms, control laws, links and duration.
+            scenario: Scenario to run.
         """
         if scenario.expect.metrics:
             return RunMetrics.of_log(SimulatedLog(scenario))
@@ -848,17 +830,18 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
         cls,
         scenarios: Sequence[Scenario],
     ) -> "Iterator[tuple[int, RunMetrics, str]]":
-        """Runs several scenarios in virtual time, as many as possible at once.
+        """Runs and measures several scenarios in virtual time, as many at once as possible.
 
-        Scenarios that differ only in numbers are computed together with vector instructions.
-        The metrics equal those of `of_virtual_run` bit for bit.
+        Scenarios that have the same structure and differ only in numerical parameters are
+        computed together with vector instructions. The metrics are identical to those of
+        `of_virtual_run`, bit for bit.
 
         Args:
             scenarios: The scenarios.
 
         Yields:
-            The index of a scenario; the metrics of its run; and the property because of which
-            the run was computed alone, or an empty text.
+            The index of a scenario, the metrics of its run, and the reason why it was computed
+            alone (an empty string if it was not).
         """
         indices = []
         measured_runs = []
@@ -879,12 +862,12 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of_log(cls, log: Log, expect: Expect | None = None) -> "RunMetrics":
-        """Computes errors, torques and other quantities of a recorded run from its log.
+        """Measures a recorded run from its log.
 
         Args:
             log: Log of the run.
-            expect: Expectations (limits of the metrics) that replace those of the log's
-                scenario. If `None`, the scenario's expectations are used.
+            expect: Expectations to use in place of those in the log's scenario. If `None`, the
+                scenario's expectations are used.
 
         Raises:
             LogError: A record cannot be read.
@@ -933,10 +916,10 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.structs.replace(metrics, metrics=expected_metrics)
 
     def compare_with(self, expect: Expect) -> "list[ExpectationResult]":
-        """Compares the metrics of a run with the expectations that its scenario states.
+        """Compares the metrics of the run with the expectations of its scenario.
 
-        If the run diverged, which means that an arm left its limits, the expectation `stable`
-        is always reported, even if the scenario does not state it.
+        If the run diverged (an arm left its limits), the expectation `stable` is always
+        reported, even if the scenario does not state it.
 
         Args:
             expect: Expectations of the scenario, for example the largest permitted error.
@@ -1025,7 +1008,7 @@ def _compute_run_metrics(
             name: Name of the statistic, an attribute of `SiteStats`.
 
         Returns:
-            The largest value. `None` if no site has recorded anything.
+            The largest value, or `None` if no site has recorded anything.
         """
         values = [getattr(stats, name) for stats in with_records.values()]
         return max(values, default=None)
@@ -1181,7 +1164,7 @@ class _EvenBatches:
         self._count = 0
 
     def add(self, batch: RecordBatch) -> None:
-        """Takes the next records of a site, and passes on all complete batches."""
+        """Adds the next records of a site and passes on every batch that is complete."""
         if not self._waiting and len(batch.t_ns) == BATCH_RECORDS:
             self._receive(batch)
             return
@@ -1198,7 +1181,7 @@ class _EvenBatches:
         self._waiting = [rest] if self._count else []
 
     def flush(self) -> None:
-        """Passes on the last records, which are fewer than a batch."""
+        """Passes on the remaining records, which do not fill a batch."""
         if self._waiting:
             self._receive(RecordBatch.join(self._waiting))
             self._waiting.clear()
@@ -1231,13 +1214,13 @@ class _MeasuredRun:
             self.compiled = _CompiledRun(scenario, receivers)
 
     def measure_ticks(self) -> RunMetrics:
-        """Simulates the run tick by tick, and returns its metrics."""
+        """Simulates the run tick by tick and returns its metrics."""
         receivers = {name: stats.add for name, stats in self._stats.items()}
         diverged_at_s, late_samples = run_in_batches(self._scenario, receivers)
         return self._measure(diverged_at_s, late_samples)
 
     def measure_compiled(self, run: FusedRun) -> RunMetrics:
-        """Returns the metrics of a finished run.
+        """Returns the metrics of a run that the compiled loop has finished.
 
         Args:
             run: The run.
@@ -1270,9 +1253,7 @@ class _MeasuredRun:
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
-    """Result of comparing one metric of a run with the limit that the scenario states for it.
-
-    Such a limit is called an expectation and has a key in the scenario's table [expect].
+    """Result of comparing one metric of a run with its limit in the table [expect].
 
     Attributes:
         key: Key in the table [expect], or the name of a requirement that every run must meet.
@@ -1280,9 +1261,9 @@ class ExpectationResult(msgspec.Struct, frozen=True):
         measured: Measured value as a string with its unit.
         limit: Limit as a string with its unit.
         margin: Distance of the measured value from the limit as a fraction of the limit,
-            negative beyond the limit. `None` if the expectation is not about a number.
-        value: Measured number in the unit of the limit. `None` if the expectation is not about
-            a number.
+            negative beyond the limit. `None` if the expectation is not numerical.
+        value: Measured value in the unit of the limit. `None` if the expectation is not
+            numerical.
     """
 
     key: str
@@ -1495,12 +1476,12 @@ _VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
 
 
 def describe_program() -> tuple[str, dict[str, str]]:
-    """Returns the properties of this program and machine on which numerical results depend.
+    """Returns the properties of this program and machine that can affect numerical results.
 
-    Results of a study are mixed only if these properties are the same.
+    Results of a study are combined only if these properties are the same.
 
     Returns:
-        A fingerprint of how the machine rounds floating point numbers; and the versions of the
+        A fingerprint of how the machine rounds floating-point numbers; and the versions of the
         program and of the packages that compute the results.
     """
     provenance = collect_provenance()

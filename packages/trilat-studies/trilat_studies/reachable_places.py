@@ -1,11 +1,11 @@
-"""Finds out whether the end effector of an arm can reach a position.
+"""Checks whether the end effector of an arm can reach a position.
 
-The tasks of a training environment use this to draw goals that can be reached. For a planar arm
-with two links, the lengths of the links determine the answer. For a chain of more joints, a
-pose within the joint limits is searched for numerically.
+The tasks of a training environment use this to draw goals within reach. For a planar two-link
+arm, the answer follows from the lengths of the links. For a chain with more joints, a numerical
+search looks for a pose within the joint limits.
 
 Invariant:
-    - A position that counts as reachable can be reached.
+    - A position reported as reachable can be reached.
     - The converse does not hold: the search may miss a position that a chain can reach.
 """
 
@@ -34,15 +34,14 @@ _LARGEST_STEP_RAD = 0.5
 
 
 def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Array) -> bool:
-    """Returns True if a pose was found in which the end effector of an arm is at a position.
+    """Returns True if a pose was found that places the end effector at a given position.
 
-    For an arm with two links, the lengths of the links decide. For a chain of more joints, the
-    function searches for a pose within the joint limits, and may not find an existing pose.
+    For a two-link arm, the link lengths decide. For a chain with more joints, a numerical
+    search within the joint limits decides, and may miss an existing pose.
 
     Args:
         arm: Model of the arm.
-        start_rad: Joint angles from which the search for a pose of a chain starts, shape (n,),
-            in rad.
+        start_rad: Joint angles from which the search starts for a chain, shape (n,), in rad.
         position_m: The position, in the coordinates of `ArmModel.end_effector`, in m.
     """
     if arm.chain is not None:

@@ -1,7 +1,8 @@
-"""Composes the command with which a user can repeat one run of a study.
+"""Composes the shell command with which a user can repeat one run of a study.
 
 A sweep or a trial reports, for example, "trilat sim paper --set link.delay_ms=200". The
-functions convert values to texts KEY=VALUE for the option --set, and quote them for a shell.
+functions in this module convert values to KEY=VALUE strings for the option --set and quote them
+for a shell.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,21 +16,22 @@ from trilat_net.scenario import is_distribution, is_number
 
 
 def format_command(*arguments: str) -> str:
-    """Returns a command that a user can paste into a shell: "trilat sim 'my run.toml'".
+    """Returns a command that can be pasted into a shell, such as "trilat sim 'my run.toml'".
 
-    Arguments with spaces or special characters are quoted. The word "trilat" is put first.
+    Starts the command with "trilat", and quotes arguments that contain spaces or special
+    characters.
     """
     return join_arguments(["trilat", *arguments])
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns command-line options --set that change settings of a scenario.
+    """Returns the --set options for a list of scenario overrides.
 
     Args:
-        overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
+        overrides: Strings KEY=VALUE, such as "link.delay_ms=100".
 
     Returns:
-        The arguments "--set" and KEY=VALUE, alternately.
+        The arguments "--set" and KEY=VALUE, alternating.
     """
     arguments = []
     for text in overrides:
@@ -38,13 +40,13 @@ def set_options(overrides: Iterable[str]) -> list[str]:
 
 
 def format_toml_value(value: Any) -> str:
-    """Returns a value as TOML on one line, for commands and overrides.
+    """Formats a value as TOML on one line, for commands and overrides.
 
-    A number is written with as few digits as possible, such that it parses back to the same
-    number.
+    A number is written with as few digits as possible while still parsing back to exactly the
+    same number.
 
     Args:
-        value: A number, text, list or table.
+        value: A number, string, list or table.
 
     Raises:
         ScenarioError: TOML cannot express the value.
@@ -71,20 +73,21 @@ def format_toml_value(value: Any) -> str:
 
 
 def format_override_value(value: Any) -> str:
-    """Returns the text of the value in an override KEY=VALUE.
+    """Formats the value of an override KEY=VALUE.
 
     Args:
-        value: A number, whose text parses back to exactly this number and has no decimal point
-            if the number is whole. Any other value, such as a word, becomes its text.
+        value: A number is formatted so that it parses back to exactly the same number, with no
+            decimal point if it is an integer. Any other value, such as a word, is converted to
+            a string.
     """
     return repr(value).removesuffix(".0") if is_number(value) else str(value)
 
 
 def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields changed settings in nested tables as texts KEY=VALUE for the command line.
+    """Yields the overrides in nested tables as KEY=VALUE strings for the command line.
 
     Args:
-        overrides: Values by key. A value may be a nested table.
+        overrides: Mapping from key to value. A value may be a nested table.
         prefix: Keys of the enclosing tables, each followed by a dot.
     """
     for key, value in overrides.items():

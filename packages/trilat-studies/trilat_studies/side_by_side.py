@@ -1,9 +1,9 @@
 """Decides which runs of a study are computed side by side, and reports the others.
 
-Runs that differ only in numbers are computed together with vector instructions, see
-`trilat_net.core.RunGroup`. A study passes a scenario of each kind of run to `prepare_kinds`,
-which compiles the code if there are enough runs to be worth it. After the runs,
-`describe_runs_alone` names those that were computed one by one.
+Runs that differ only in numerical parameters are computed together with vector instructions,
+see `trilat_net.core.RunGroup`. A study passes one scenario per kind of run to `prepare_kinds`,
+which compiles the code if there are enough runs to make this worthwhile. After the runs,
+`describe_runs_alone` reports those that were computed one by one.
 """
 
 from collections.abc import Hashable, Mapping
@@ -24,11 +24,11 @@ site tick.
 
 
 class RunKind(NamedTuple):
-    """Runs of a study whose scenarios probably differ only in numbers, such as the seed.
+    """Runs of a study that probably differ only in numerical parameters, such as the seed.
 
     Attributes:
         scenario: Scenario of one of the runs.
-        runs: Number of the runs.
+        runs: Number of runs of this kind.
     """
 
     scenario: Scenario
@@ -36,7 +36,7 @@ class RunKind(NamedTuple):
 
     @property
     def site_ticks(self) -> float:
-        """Number of ticks of all sites in all runs."""
+        """Total number of ticks over all sites and runs."""
         rates_hz = [spec.rate_hz for spec in self.scenario.sites.values()]
         return self.runs * self.scenario.duration_s * sum(rates_hz)
 
@@ -44,16 +44,17 @@ class RunKind(NamedTuple):
 def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
     """Chooses the kinds of runs to compute side by side, and compiles the code for them.
 
-    Unless the compiled code exists, the runs must be long enough to make the compilation
-    worthwhile. Runs that cannot be computed side by side are chosen too if they are this long,
-    or if other runs of the study are computed side by side. The study then reports the reason.
+    If the code has not been compiled before, a kind is chosen only if its runs are long enough
+    to make the compilation worthwhile. Kinds that cannot be computed side by side are chosen as
+    well if they are this long, or if other kinds in the study are computed side by side, so
+    that the study can report the reason.
 
     Args:
-        kinds: Kinds of runs, by any keys.
+        kinds: Kinds of runs, under arbitrary keys.
 
     Returns:
-        For each chosen kind, the property because of which its runs are still computed one by
-        one, or an empty text.
+        For each chosen kind, the reason why its runs are still computed one by one, or an empty
+        string.
     """
     several = {key: kind for key, kind in kinds.items() if kind.runs > 1}
     if not several:
@@ -83,15 +84,14 @@ def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
 
 
 def describe_runs_alone(reasons: Mapping[str, int], run_count: int) -> str:
-    """Returns a sentence that states which runs were not computed side by side, and why.
+    """Returns a sentence that states how many runs were not computed side by side, and why.
 
     Args:
-        reasons: Reasons why runs were computed alone, with the number of these runs.
+        reasons: Maps each reason why runs were computed alone to the number of these runs.
         run_count: Number of all runs of the study.
 
     Returns:
-        A sentence with the numbers of these runs and of all runs, and the reasons. Empty if all
-        runs were computed side by side.
+        The sentence, or an empty string if all runs were computed side by side.
     """
     if not reasons:
         return ""

@@ -1,12 +1,12 @@
 """The commands `trilat test`, `compare`, `tune` and `bench`, which study several runs.
 
-Such a command runs a scenario many times, with different seeds, control laws, gains or delays,
-or reads the logs of earlier runs. Then it prints the results side by side.
+These commands run a scenario many times with different seeds, control laws, gains or delays, or
+read logs of earlier runs, and then print the results side by side.
 
 Invariant:
-    - The commands print measured numbers. They do not rank control laws, because which number
-      matters depends on the task.
-    - An interrupted benchmark continues if the same command is entered again.
+    - The commands print measured values. They do not rank control laws, because it depends on
+      the task which quantity matters.
+    - An interrupted benchmark continues when the same command is entered again.
 """
 
 import os
@@ -80,14 +80,14 @@ def test_command(
     failure, the command that repeats the run is printed.
     """
     from trilat_net.files import write_whole
-    from trilat_net.work import check_workers
+    from trilat_net.work import WorkerPool
 
     if live and on is not None:
         raise UsageError(
             "--on distributes runs in virtual time and cannot be combined with --live: leave "
             "out one of the two"
         )
-    check_workers(jobs, on)
+    WorkerPool.check_options(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
         raise UsageError(f"{junit} cannot be written")
     trials = _list_trials(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
@@ -105,10 +105,10 @@ def parse_seeds(text: str | None) -> list[int]:
     """Parses a list of random seeds, written as 1..20 or 1,5,9 or 1..3,8.
 
     Args:
-        text: The text. `None` if the user gave no seeds.
+        text: The argument of the option, or `None` if the user gave no seeds.
 
     Returns:
-        The seeds. Empty if there is no text.
+        The seeds. Empty if the user gave none.
 
     Raises:
         UsageError: The text does not have this form, or names more than `MAX_SEEDS` seeds.
@@ -179,9 +179,9 @@ def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "Tr
     with terminal.progress_bar("running the trials") as show:
 
         def report_done(result: "TrialResult") -> None:
-            """Updates the progress that the user sees after one run of a scenario has finished.
+            """Updates the progress display after one run of a scenario has finished.
 
-            Without a terminal, a line is printed when all runs of the same scenario have
+            Without a terminal, one line is printed per scenario, when all of its runs have
             finished.
 
             Args:
@@ -268,11 +268,11 @@ def _run_tuning(
         as_json: True to print the result as JSON.
     """
     from trilat_net.files import make_results_folder
-    from trilat_net.work import count_workers
+    from trilat_net.work import WorkerPool
 
     from .tuning.tuning_report import TuningReport, describe_procedure
 
-    workers = count_workers(jobs, on)
+    workers = WorkerPool.count_workers(jobs, on)
     name = plan.base.scenario.name
     results_folder = make_results_folder(folder, f"tune-{name}", force=force)
     if not as_json:
@@ -615,13 +615,13 @@ def bench_command(
         output: Folder for the results; a suite that the folder already contains is continued.
             Default: runs/bench-STUDY.
     """
-    from trilat_net.work import check_workers
+    from trilat_net.work import WorkerPool
 
     from .bench import plan_bench, prepare_bench_folder
     from .bench.bench_figures import write_bench
     from .run_commands import format_command
 
-    check_workers(jobs, on)
+    WorkerPool.check_options(jobs, on)
     chosen_study = "small" if small else study
     laws = options.split_names(law)
     if tune:

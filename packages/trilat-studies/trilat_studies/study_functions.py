@@ -1,11 +1,11 @@
 """The Python functions for studies of many runs: `sweep`, `margin`, `tune` and `bench`.
 
-A user calls them as functions of trilat_net, for example `trilat_net.sweep("paper",
-{"link.delay_ms": [0, 100]})`. Each does what a command does: `trilat sweep`, `trilat sweep
---margin`, `trilat compare --tune` or `trilat bench`.
+They are called as functions of trilat_net, for example `trilat_net.sweep("paper",
+{"link.delay_ms": [0, 100]})`. Each has a command that does the same: `trilat sweep`, `trilat
+sweep --margin`, `trilat compare --tune` and `trilat bench`.
 
 Invariant:
-    - These functions only convert their arguments, and call the modules that do the work.
+    - These functions only convert their arguments and call the modules that do the work.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,7 +65,7 @@ def sweep(
 ) -> "SweepResults":
     """Runs a scenario over a grid of values of its keys, and judges the stability of each run.
 
-    The command is `trilat sweep`.
+    The command `trilat sweep` does the same.
 
     >>> axes = {"control.d": [0.3, 3.0]}
     >>> found = tn.sweep("p_d_margin", axes, duration_s=2, out="grid", jobs=1)
@@ -73,30 +73,29 @@ def sweep(
     2
 
     Args:
-        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
-            a path, a TOML text, its tables, or a `Scenario`.
-        over: Axes of the grid: lists or arrays of values by key, as in
-            `{"link.delay_ms": range(0, 1601, 50)}`, or texts, as in
+        scenario: Name of a shipped scenario, a path, a TOML string, its tables, or a
+            `Scenario`.
+        over: Axes of the grid, either a mapping from scenario key to values, such as
+            `{"link.delay_ms": range(0, 1601, 50)}`, or strings, such as
             `["link.delay_ms=0:1600:50"]`.
-        set: Settings that replace those of the scenario in all cells of the grid, as in
-            `{"control.Kd": 5}`.
-        seeds: Number of seeds of random delays and losses, or the seeds. Each cell, a point of
-            the grid, has one run per seed.
-        laws: Names or classes of control laws, which are a further axis of the grid.
-        duration_s: First duration of the runs of a cell, in s.
-        longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
-            Default: eight times `duration_s`, or `duration_s` if `judge` is "twins".
+        set: Scenario overrides for all cells of the grid, such as `{"control.Kd": 5}`.
+        seeds: Number of seeds for random delays and losses, or a list of seeds. Each cell (a
+            point of the grid) is run once per seed.
+        laws: Names or classes of control laws, which form another axis of the grid.
+        duration_s: Initial duration of each run, in s.
+        longest_s: Longest duration to which a run is extended while its stability is open, in
+            s. Default: eight times `duration_s`, or `duration_s` if `judge` is "twins".
         judge: "verdict", "twins" or "linear". Twins are two runs that differ by a small
-            disturbance. With "twins", the exponent with which the disturbance grows is measured
-            in each cell, in addition to its verdict. With "linear", nothing is simulated: a
-            cell has the growth rate of its linear loop.
-        metrics: Keys of docs/reference/metrics.md that are measured in each run. They become
-            columns of the rows.
+            disturbance. With "twins", the growth exponent of this disturbance is measured in
+            each cell, in addition to the verdict. With "linear", nothing is simulated, and each
+            cell contains the growth rate of its linearised loop.
+        metrics: Keys of docs/reference/metrics.md to measure in each run. They become columns
+            of the rows.
         refine: Number of halvings along the stability edge. The sweep begins with every
             2^refine-th value of the first two numeric axes. If 0, all cells are run.
-        out: Folder of the results. A sweep in this folder is continued. Default: the next free
-            folder runs/sweep-NAME-N.
-        jobs: Number of processes. If `None`, there is one per core.
+        out: Folder for the results. A sweep that is already in this folder is continued.
+            Default: the next free folder runs/sweep-NAME-N.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:
@@ -136,26 +135,26 @@ def margin(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepMargins":
-    """Searches for the edge of stability along a key; the command is `trilat sweep --margin`.
+    """Searches for stability edges along a scenario key, as does `trilat sweep --margin`.
 
-    The edge is the value of the key at which runs change from stable to not stable.
+    An edge is a value of the key at which runs change from stable to not stable, or back.
 
     >>> found = tn.margin("p_d_margin", "control.d=0.2:3", tolerance=0.2, duration_s=4, jobs=1)
     >>> [search.margin.spans[0].stable_below for search in found.found]
     [False]
 
     Args:
-        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
-            a path, a TOML text, its tables, or a `Scenario`.
-        along: The key and its range, as in "control.d=0.2:3".
-        over: Axes of a grid. The edge is searched for at each point of the grid, as in `sweep`:
-            `{"link.delay_ms": [100, 200]}`.
-        set: Settings that replace those of the scenario in all runs.
+        scenario: Name of a shipped scenario, a path, a TOML string, its tables, or a
+            `Scenario`.
+        along: The key and its range, such as "control.d=0.2:3".
+        over: Axes of a grid, as in `sweep`, such as `{"link.delay_ms": [100, 200]}`. The edges
+            are searched for at each point of the grid.
+        set: Scenario overrides for all runs.
         tolerance: Largest width of the interval that contains an edge, relative to its value.
-        seeds: Number of seeds of random delays and losses, or the seeds.
-        laws: Names or classes of control laws, which are a further axis of the grid.
-        duration_s: First duration of a run, in s.
-        jobs: Number of processes. If `None`, there is one per core.
+        seeds: Number of seeds for random delays and losses, or a list of seeds.
+        laws: Names or classes of control laws, which form another axis of the grid.
+        duration_s: Initial duration of each run, in s.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:
@@ -190,28 +189,28 @@ def tune(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "TuningResult":
-    """Compares control laws that one procedure tunes; the command is `trilat compare --tune`.
+    """Tunes control laws with the same procedure and compares them.
 
-    The procedure tries the same number of candidates for the gains of each law.
+    The command `trilat compare --tune` does the same. The same number of candidate gains is
+    tried for each law.
 
     >>> found = tn.tune("free", ["p_d"], budget=2, duration_s=2, jobs=1)
     >>> [law.space.law for law in found.found]
     ['p_d']
 
     Args:
-        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
-            a path, a TOML text, its tables, or a `Scenario`.
-        laws: Names or classes of the laws. If empty, all laws for any number of sites are
-            selected.
-        set: Settings that replace those of the scenario, as in `{"link.delay_ms": 100}`.
+        scenario: Name of a shipped scenario, a path, a TOML string, its tables, or a
+            `Scenario`.
+        laws: Names or classes of the laws. If empty, all laws that support any number of sites.
+        set: Scenario overrides, such as `{"link.delay_ms": 100}`.
         budget: Number of candidates per law.
-        seed: Seed of the search, which draws the candidates.
+        seed: Random seed of the search, which draws the candidates.
         seeds: Number of seeds of the scenario over which each candidate is averaged.
-        objective: Quantity that the search minimises besides the effort of the arms: the
-            tracking error ("error") or the settling time ("settling").
+        objective: Quantity to minimise in addition to the effort of the arms: the tracking
+            error ("error") or the settling time ("settling").
         gravity_percent: Gravity that all laws assume, in % of the true gravity.
         duration_s: Duration of a run, in s. Default: the scenario's duration.
-        jobs: Number of processes. If `None`, there is one per core.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:
@@ -250,7 +249,7 @@ def bench(
 ) -> "BenchResults":
     """Runs the benchmark suite, which compares control laws in the same tasks and links.
 
-    The command is `trilat bench`, which also writes tables and figures.
+    The command `trilat bench` does the same, and also writes tables and figures.
 
     >>> cell = {"tasks": ["free"], "laws": ["p_d"], "links": ["rtt68"]}
     >>> found = tn.bench(**cell, seeds=1, out="suite", jobs=1)
@@ -259,16 +258,16 @@ def bench(
 
     Args:
         study: Part of the suite: full, small or round-trips.
-        tasks: Names of the selected tasks. If empty, all tasks of the study are selected.
-        laws: Names of the selected laws. If empty, all laws of the study are selected.
-        links: Names of the selected links (network conditions), as in "rtt68-loss10" or "4g".
-            If empty, all links of the study are selected.
-        seeds: Number of seeds of random delays and losses. Default: the number of the study.
+        tasks: Names of the tasks to run. If empty, all tasks of the study.
+        laws: Names of the laws to run. If empty, all laws of the study.
+        links: Names of the links (network conditions) to run over, such as "rtt68-loss10" or
+            "4g". If empty, all links of the study.
+        seeds: Number of seeds for random delays and losses. Default: the study's own number.
         confirm: Has no effect. Every run that is not stable is repeated over twice its
             duration, which confirms or refutes the verdict.
-        out: Folder of the results. A suite in this folder is continued. Default:
-            runs/bench-STUDY.
-        jobs: Number of processes. If `None`, there is one per core.
+        out: Folder for the results. A suite that is already in this folder is continued.
+            Default: runs/bench-STUDY.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.
 
     Returns:

@@ -1,12 +1,11 @@
 """`trilat sweep`: runs a scenario over a grid of its keys, maps stability, and finds edges.
 
-A scenario is a TOML file that describes an experiment, and its keys are the values that can be
-varied, such as a gain or a delay. A cell of the grid is a combination of values of the keys. An
+A cell of the grid is a combination of values of scenario keys, such as a gain or a delay. An
 edge is the value of a key at which runs change from stable to not stable.
 
 Invariant:
-    - Everything that is printed is also written to the result files. Runs that take place live
-      over a network are an exception: their results are in their logs.
+    - Everything that is printed is also written to the result files, except for live runs over
+      a network, whose results are in their logs.
     - An interrupted sweep prints the command that resumes it.
 """
 
@@ -173,7 +172,7 @@ def _run_sweep(
     Returns:
         The finished sweep.
     """
-    from trilat_net.work import count_workers
+    from trilat_net.work import WorkerPool
 
     from .side_by_side import describe_runs_alone
     from .sweep import sweep_results, sweep_run
@@ -194,7 +193,7 @@ def _run_sweep(
         done_text = count_nouns(len(finished_runs), "run is", "runs are")
         terminal.print_text(f"  {done_text} done already")
 
-    workers = count_workers(jobs, on)
+    workers = WorkerPool.count_workers(jobs, on)
     estimate = sweep_run.DurationEstimate.of_sweep(plan, finished_runs, workers)
     if not yes:
         estimate.refuse_oversized_sweep(plan, workers)
@@ -491,14 +490,14 @@ def _refuse_plan_options(used_options: Sequence[str]) -> None:
 def parse_seed_count(text: str | None) -> int | list[int]:
     """Parses the option --seeds of a sweep.
 
-    A string such as 10 is a number of seeds. Strings such as 1..20, 1,5,9 or 7, (with a comma)
-    are lists of seeds.
+    A single number such as 10 is the number of seeds. Forms such as 1..20, 1,5,9 or 7, (with a
+    comma) are lists of seeds.
 
     Args:
-        text: The text. `None` if the user did not use the option.
+        text: The argument of the option, or `None` if the user did not use it.
 
     Returns:
-        The number of seeds, or the list of the seeds. 1 if there is no text.
+        The number of seeds, or the list of seeds. 1 if the option was not used.
     """
     if text is None:
         return 1

@@ -1,19 +1,19 @@
 """A Gymnasium environment for training a policy that operates one arm over the network.
 
-The policy takes the place of one user of an experiment. In each step, it observes what that
-user can observe: the state of the user's own arm, and the states of the other arms, which
-arrive with the delay of the network. Its action is a target for the arm, or a force on it. All
-arms are simulated, as fast as possible.
+The policy takes the place of one user. In each step, it observes what that user can observe:
+the state of the user's own arm, and the states of the other arms as they arrive over the
+delayed network. Its action is a target for the arm, or a force on it. All arms are simulated,
+as fast as possible.
 
 Invariant:
     - An episode depends only on the scenario, the seed and the actions. If the episode is saved
       as a log, this log can be verified bit for bit.
-    - A step is a fixed number of ticks of the control loop. An invalid action is rejected
-      without a step and without any change.
+    - A step is a fixed number of ticks. An invalid action is rejected without advancing or
+      changing the episode.
     - The observations, and the time at which an action takes effect, are the same as for a
-      user-written operator (`OwnHand`). Therefore a trained policy can operate an arm in a live
-      session without changes. Only orientations differ: they are observed as six numbers, which
-      never jump (`expand_poses`).
+      user-written operator (`OwnHand`), so a trained policy can operate an arm in a live
+      session without changes. The only difference is that orientations are observed as six
+      numbers, which never jump (`expand_poses`).
 """
 
 import math
@@ -42,9 +42,9 @@ from trilat_net.scenario import (
     HandPlayer,
     HandSite,
     LiveHand,
+    PlantPlayer,
     Scenario,
     load_scenario,
-    make_plant_players,
 )
 
 from .reachable_places import can_reach
@@ -76,26 +76,26 @@ found by a numerical search.
 
 
 class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
-    """A method of the environment was called while no episode was in progress.
+    """Raised when a method of the environment is called while no episode is in progress.
 
-    The episode has not begun, or it has ended. `TeleoperationEnv.reset` begins an episode.
+    Either no episode has begun or the last one has ended. `TeleoperationEnv.reset` begins an
+    episode.
     """
 
 
 class Scene(NamedTuple):
-    """True state of an episode at a step, from which the task computes the reward.
+    """True state of an episode at one step, from which the task computes the reward.
 
-    The object contains the current states of all arms, which the user sees only with a delay.
+    It contains the current states of all arms, which the user sees only with a delay.
 
     Attributes:
         t_s: Time since the start of the run, in s.
         q: Joint angles of each site, shape (n,), in rad.
         end_effector_m: Position of the end effector of each site, in m.
         view: State as the user observes it.
-        bodies: Poses of simulated bodies, by the site that simulates them and by name. A pose
-            has the shape (7,), as in a record.
-        can_reach: Function that returns whether the end effector of a site can reach a
-            position, in m.
+        bodies: Poses of simulated bodies, by the site that simulates them and by name. Each
+            pose has the shape (7,), as in a record.
+        can_reach: Returns whether the end effector of a site can reach a position, in m.
         draws: Largest number of random positions that a task may try until one is within reach.
     """
 
@@ -109,12 +109,12 @@ class Scene(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """A task's judgement of one step: the reward, and whether the task is done or has failed.
+    """A task's evaluation of one step: the reward, and whether the task succeeded or failed.
 
     Attributes:
         reward: Reward of the step.
-        succeeded: True if the task is done, which ends the episode.
-        failed: True if the task can no longer be done, which ends the episode.
+        succeeded: True if the task is complete, which ends the episode.
+        failed: True if the task can no longer be completed, which ends the episode.
     """
 
     reward: float
@@ -123,10 +123,10 @@ class Judgement(NamedTuple):
 
 
 class EpisodeTask(Protocol):
-    """Interface of the task of an episode: it draws a goal and computes the rewards.
+    """Interface for the task of an episode, which draws a goal and computes the rewards.
 
-    A user can write a class with these methods. The environment calls `begin` at the start of
-    each episode, and `judge` after each step.
+    Users can implement their own tasks with these methods. The environment calls `begin` at the
+    start of each episode and `judge` after each step.
     """
 
     goal: Array
@@ -135,15 +135,15 @@ class EpisodeTask(Protocol):
     """Bound on the numbers of the goal. It must never change."""
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws the goal of a new episode. The environment calls this once per episode.
+        """Draws the goal of a new episode. Called once per episode.
 
         Args:
-            random: Source of random numbers.
+            random: Random number generator.
             scene: State at the start of the episode.
         """
 
     def judge(self, scene: Scene) -> float | tuple[Any, ...]:
-        """Computes the reward of a step, and decides whether the episode ends.
+        """Computes the reward of a step and decides whether the episode ends.
 
         Args:
             scene: State after the step.
@@ -154,11 +154,11 @@ class EpisodeTask(Protocol):
 
 
 class ReachTask:
-    """Task to bring an end effector to a random position and to keep it there.
+    """The task of bringing an end effector to a random position and keeping it there.
 
     The reward of a step is minus the distance from the goal, in m, times the duration of the
-    step, in s. The reward is larger by 1 once the end effector has stayed at the goal for
-    `stay_s`, which ends the episode.
+    step, in s. Once the end effector has stayed at the goal for `stay_s`, the reward is
+    increased by 1 and the episode ends.
 
     Args:
         site: Site of the end effector.
@@ -168,7 +168,7 @@ class ReachTask:
 
     Attributes:
         site, within_m, stay_s: The arguments of the same names.
-        reached_s: Time since which the end effector has been at the goal, in s.
+        reached_s: Latest time at which the end effector was not at the goal, in s.
         last_s: Time of the last step, in s.
     """
 
@@ -189,16 +189,16 @@ class ReachTask:
         self.last_s = 0.0
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws a goal, uniformly over the part of a sphere that the end effector can reach.
+        """Draws a goal uniformly from the part of a sphere that the end effector can reach.
 
         The centre of the sphere is the position of the end effector at the start.
 
         Args:
-            random: Source of random numbers.
+            random: Random number generator.
             scene: State at the start of the episode.
 
         Raises:
-            UsageError: No drawn position is within reach.
+            UsageError: None of the drawn positions is within reach.
         """
         start_m = scene.end_effector_m[self.site]
         dimensions = len(start_m)
@@ -225,18 +225,17 @@ class ReachTask:
         self.last_s = scene.t_s
 
     def judge(self, scene: Scene) -> Judgement:
-        """Computes the reward of a step, and checks whether the reaching task is done.
+        """Computes the reward of a step and checks whether the reaching task is complete.
 
-        The reward is the negative distance from the end effector to the goal, in m, times the
-        duration of the step, in s. A reward of 1 is added when the task is done. The task is
-        done when the end effector has stayed within the tolerance around the goal for the
-        required time.
+        The reward is minus the distance from the end effector to the goal, in m, times the
+        duration of the step, in s, plus 1 when the task is complete. The task is complete when
+        the end effector has stayed within the tolerance around the goal for the required time.
 
         Args:
             scene: State of the arms after the step.
 
         Returns:
-            The reward, and whether the task is done. If it is done, the episode ends.
+            The reward, and whether the task is complete, which ends the episode.
         """
         from_goal_m = scene.end_effector_m[self.site] - self.goal
         distance_m = float(np.linalg.norm(from_goal_m))
@@ -265,12 +264,11 @@ class _ActedHand(HandPlayer):
     def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - already observed
         """Applies the policy's action for the current step as the decision of the operator.
 
-        The simulation calls this method whenever the operator has to decide.
+        The simulation calls this method whenever the operator must decide.
 
         Args:
-            k: Period of the control loop in which the decision is due, from 0.
-            arrays: State of the arm. It is not used, because the policy has observed it
-                already.
+            k: Tick in which the decision is due, from 0.
+            arrays: State of the arm. Ignored, because the policy has already observed it.
         """
         action = self._actions[k // self.hand.period_ticks]
         self.hand.accept_decision(k, action.tolist())
@@ -282,21 +280,20 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     `make_env` creates this object and explains its arguments.
 
     Attributes:
-        observation_names: With `flat`, the name of each number of an observation, as in
-            "q[0]". A number of a matrix has two indices, its row and its column.
-        observation_scales: Typical size of each number of an observation: a dictionary of
-            arrays, or with `flat` one array. An observation divided by its scale is of the
-            order of 1. The sizes come from the reach of the arms and from the scenario's limits
-            of speed and torque.
-        user: Site whose arm the actions move.
-        leads: Site that does the task.
-        ticks_per_step: Number of ticks of a step.
+        observation_names: With `flat`, the name of each entry of an observation, such as
+            "q[0]". Entries of a matrix have two indices, the row and the column.
+        observation_scales: Typical magnitude of each entry of an observation: a dictionary of
+            arrays or, with `flat`, a single array. An observation divided by its scale is of
+            order 1. The scales are derived from the reach of the arms and the scenario's limits
+            on speed and torque.
+        user: Site whose arm is moved by the actions.
+        leads: Site that performs the task.
+        ticks_per_step: Number of ticks per step.
 
     Raises:
         ScenarioError: The scenario or an override is not valid.
-        UsageError: There is no such site, the rate is not valid, or Gymnasium is missing. The
-            same error is raised if another argument has an invalid value, which the message
-            names.
+        UsageError: There is no such site, the rate is not valid, Gymnasium is missing, or
+            another argument has an invalid value, which the message names.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's
@@ -486,11 +483,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             load_scenario(self._base, {key: values[end] for key, values in self._vary.items()})
 
     def build_hand_site(self, scenario: Scenario) -> HandSite:
-        """Returns the arm that the agent moves, with the limits of its force or position.
+        """Returns the arm that the agent moves, with its force or position limits.
 
         Args:
-            scenario: The experiment of one episode, in which the user's site has such an
-                operator.
+            scenario: Scenario of one episode, in which the user's site has such an operator.
         """
         spec = scenario.sites[self.user]
         hand = spec.find_live_hand()
@@ -542,7 +538,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._clipped_actions = 0
         hand_site = self.build_hand_site(scenario)
         self._player = _ActedHand(hand_site, self._actions)
-        self._plants = make_plant_players(scenario)  # users' programs that move arms, by site
+        self._plants = PlantPlayer.make_all(scenario)  # users' programs that move arms, by site
         hands = {self.user: self._player}
         ticks = [scenario.ticks(name) for name in scenario.names]
         # The environment reads the state of the last tick only, so one record is kept.
@@ -599,10 +595,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
         """Returns True if the end effector of an arm can reach a position.
 
-        Tasks that draw random goals use it, so that every goal can be reached.
+        Tasks that draw random goals use this to make sure that every goal can be reached.
 
         Args:
-            q: Joint angles of each site, from which the search for a pose starts, in rad.
+            q: Joint angles of each site from which the search for a pose starts, in rad.
             site: Name of the site.
             position_m: The position, in m.
         """
@@ -615,12 +611,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return self.format_parts(self._observe(scene))
 
     def format_parts(self, parts: dict[str, Array], count: int | None = None) -> Any:
-        """Returns observations as the agent receives them: a dictionary, or one array (`flat`).
+        """Converts observations to the agent's format: a dictionary, or one array (`flat`).
 
         Args:
-            parts: The parts of an observation, by name. The parts of several observations have
-                an additional first axis. The dictionary is changed.
-            count: Number of observations. `None` if there is a single observation without this
+            parts: The parts of an observation, by name. With several observations, each part
+                has an additional first axis. The dictionary is modified.
+            count: Number of observations, or `None` if there is a single one with no additional
                 axis.
         """
         if self._normalize:
@@ -709,16 +705,15 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins a new episode, and draws its random goal and settings.
+        """Begins a new episode and draws its random goal and settings.
 
         Args:
-            seed: Seed of the random numbers. If `None`, the random sequence of earlier episodes
-                continues.
-            options: Overrides for this episode only, as in {"link.delay_ms": 200}.
+            seed: Random seed. If `None`, the random sequence of earlier episodes continues.
+            options: Overrides for this episode only, such as {"link.delay_ms": 200}.
 
         Returns:
-            The first observation, and the information dictionary. Its key "drawn" has the
-            settings of this episode.
+            The first observation, and the information dictionary, whose key "drawn" contains
+            the random settings of this episode.
 
         Raises:
             ScenarioError: The options or the drawn values are not valid.
@@ -746,19 +741,19 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, info
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Moves the arm by an action, and simulates the time of one step of the episode.
+        """Applies an action to the arm and simulates one step of the episode.
 
         Args:
-            action: Target of the arm or force on it, depending on the mode.
+            action: Target for the arm or force on it, depending on the mode.
 
         Returns:
-            The observation; the reward; True if the task was done or failed, or if an arm left
-            its limits; True if the episode ended by its duration; and the information
+            The observation; the reward; True if the task succeeded or failed, or if an arm left
+            its limits; True if the episode reached its full duration; and the information
             dictionary.
 
         Raises:
             UsageError: The action is not valid. The episode does not advance.
-            EpisodeError: There is no episode, or it has ended.
+            EpisodeError: No episode has begun, or it has ended.
         """
         valid_action = self._check_action(action)
         if not self._runs:
@@ -785,7 +780,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, judgement.reward, terminated, truncated, info
 
     def judge(self, scene: Scene) -> Judgement:
-        """Asks the task for the reward of a step, and whether the episode is finished.
+        """Asks the task for the reward of a step and whether the episode is finished.
 
         Args:
             scene: State after the step.
@@ -795,36 +790,37 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     @property
     def is_running(self) -> bool:
-        """True if an episode has been started by `reset` and has not ended yet."""
+        """True if `reset` has started an episode that has not ended yet."""
         return self._runs
 
     @property
     def run(self) -> FusedRun:
-        """The simulation of the present episode.
+        """The simulation of the current episode.
 
-        A vector environment may advance it instead of `step`, together with other episodes.
+        A vector environment may advance it directly, together with other episodes, instead of
+        calling `step`.
         """
         return self._run
 
     @property
     def total_ticks(self) -> int:
-        """Number of control periods (ticks) of a complete episode."""
+        """Number of ticks in a complete episode."""
         return self._ticks
 
     @property
     def plants(self) -> Mapping[str, Any]:
-        """User-written simulation models of arms, by the name of their site (controller)."""
+        """User-written simulation models of arms, by site name."""
         return self._plants
 
     def note_steps(self, actions: Sequence[Array], clipped_actions: int, *, ends: bool) -> None:
         """Records the actions of an episode that a vector environment has simulated.
 
-        The environment can then save or draw the episode as if it had simulated the steps
+        The episode can then be saved or drawn as if this environment had simulated the steps
         itself. The state of `run` must be the state after these steps.
 
         Args:
             actions: Actions of all steps of the episode, checked.
-            clipped_actions: Number of them that were clipped.
+            clipped_actions: Number of these actions that were clipped.
             ends: True if the episode has ended.
         """
         self._actions[:] = actions
@@ -860,10 +856,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return clipped
 
     def clip_actions(self, values: Array) -> tuple[Array, Any]:
-        """Limits actions to their allowed range, and reports which of them exceeded it.
+        """Clips actions to their allowed range and reports which of them exceeded it.
 
         Args:
-            values: An action, or several actions, one per row, as the policy gave them.
+            values: One action, or several actions as rows, as passed by the policy.
         """
         limit = self.action_limit
         if self._normalize:
@@ -873,10 +869,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return np.clip(values, -limit, limit), exceeds
 
     def warn_of_clipping(self, values: Array, stacklevel: int) -> None:
-        """Issues a Python warning at the first action of an agent outside of its range.
+        """Issues a Python warning the first time that an action is out of range.
 
         Args:
-            values: The action as the policy gave it.
+            values: The action as passed by the policy.
             stacklevel: Number of calls from this method to the code of the user.
         """
         if self._has_warned:
@@ -890,10 +886,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def render(self) -> Any:
-        """Draws a picture of the arms and the goal in their present state.
+        """Draws an image of the arms and the goal in their current state.
 
         Returns:
-            A picture of shape (height, width, 3). `None` if the environment has no render mode.
+            An image of shape (height, width, 3), or `None` if the environment has no render
+            mode.
 
         Raises:
             EpisodeError: No episode has begun.
@@ -913,13 +910,13 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return self._picture.draw(scene.q, scene.bodies, goal, title)
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Writes the steps of the episode so far to a log, which can be verified.
+        """Writes the episode so far to a log, which can be verified.
 
-        The run is simulated again with the same actions, because the environment keeps no
-        records.
+        Since the environment keeps no records, the run is simulated again with the same
+        actions.
 
         Args:
-            path: Name of the log.
+            path: Path of the log.
             force: True to replace an existing file.
 
         Returns:

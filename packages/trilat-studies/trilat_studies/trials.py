@@ -1,10 +1,10 @@
-"""Tests whether a scenario behaves as expected, with several random seeds.
+"""Tests whether a scenario behaves as expected with several random seeds.
 
-A scenario is the TOML file that describes an experiment. Its table [expect] states requirements
-on a run, such as the largest permitted error. A trial is a run of the scenario with one seed,
-whose measured values are compared with this table. The command is `trilat test`.
+The table [expect] of a scenario states requirements on its runs, such as the largest permitted
+error. A trial is a run of the scenario with one seed, whose metrics are compared with this
+table. The command is `trilat test`.
 
-From pytest, one test per seed:
+With pytest, one test per seed:
 
     import pytest
     import trilat_net
@@ -18,10 +18,10 @@ From pytest, one test per seed:
 All seeds in one test, on all cores: `trilat_net.check("jitter", seeds=range(1, 21))`.
 
 Invariant:
-    - One command repeats a trial, and the result of the trial contains that command.
+    - Every trial can be repeated with one command, which is included in its result.
     - The evaluation of an expectation depends only on the measured value and the limit. Its
       result contains both, and the margin, whether or not the expectation is met.
-    - Results are in the order of the trials, no matter which process ran them.
+    - Results are in the order of the trials, whichever process ran them.
     - A trial that repeatedly kills its worker process affects no other trial.
 """
 
@@ -42,11 +42,10 @@ from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, c
 from trilat_net.execution import check_virtual, execute_virtual, verify_log
 from trilat_net.log import open_log
 from trilat_net.net import SystemClock
-from trilat_net.own_code import list_imported_code
 from trilat_net.presentation import Block, MarkedText, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import ExperimentText, Scenario, load_scenario, reseed_scenario
-from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers, open_worker_pool
+from trilat_net.scenario import ExperimentText, Scenario, load_scenario
+from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers
 
 from .measure_run import ExpectationResult, RunMetrics
 from .run_commands import format_command, list_assignments, set_options
@@ -56,7 +55,7 @@ from .side_by_side import RunKind, describe_runs_alone, prepare_kinds
 class TrialResult(NamedTuple):
     """Result of running a scenario and comparing the run with its expectations.
 
-    An expectation is a limit for a metric, which the scenario states in its table [expect].
+    An expectation is a limit on a metric, stated in the scenario's table [expect].
 
     Attributes:
         trial: The trial.
@@ -65,8 +64,8 @@ class TrialResult(NamedTuple):
         wall_s: Duration in real time, in s.
         error: Reason why the run has no result. Empty if it has a result.
         log: Log of a live trial, if it exists.
-        alone: Property because of which the run was computed alone, among trials that are
-            computed side by side. Empty if it was not computed alone.
+        alone: Reason why the run was computed alone, among trials that are computed side by
+            side. Empty if it was not computed alone.
     """
 
     trial: "Trial"
@@ -84,9 +83,9 @@ class TrialResult(NamedTuple):
 
     @property
     def failures(self) -> list[str]:
-        """Sentences about the failures of the run. Empty if the run met all expectations.
+        """One sentence per unmet expectation, or the reason why the run has no result.
 
-        A sentence states an unmet expectation, or why the run has no result.
+        Empty if the run met all expectations.
         """
         sentences = [f"no result: {self.error}"] if self.error else []
         sentences += [
@@ -119,7 +118,7 @@ class Trial(NamedTuple):
 
     @property
     def again(self) -> str:
-        """Shell command that repeats this simulation with the same random seed, to copy.
+        """Shell command that repeats this trial with the same seed.
 
         Example: "trilat test jitter --seeds 3".
         """
@@ -134,7 +133,7 @@ class Trial(NamedTuple):
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
     def evaluate(self, metrics: RunMetrics, wall_s: float) -> TrialResult:
-        """Compares measured quantities of a run with the expectations of its scenario.
+        """Compares the metrics of a run with the expectations of its scenario.
 
         Args:
             metrics: Metrics of the run.
@@ -162,10 +161,10 @@ class Trial(NamedTuple):
         return self.evaluate(metrics, wall_s)
 
     def check(self) -> TrialResult:
-        """Simulates the scenario, and returns the result if all expectations are met.
+        """Runs the trial and returns its result, or raises AssertionError if it failed.
 
         Raises:
-            AssertionError: An expectation is not met. The text contains the reasons, and the
+            AssertionError: An expectation is not met. The message contains the reasons, and the
                 commands that repeat the run and record it.
         """
         __tracebackhide__ = True  # pytest shows the reason instead of this line
@@ -180,8 +179,8 @@ class Trial(NamedTuple):
     ) -> TrialResult:
         """Compares the run of a live session with the expectations of its scenario.
 
-        Two expectations are added to those of the scenario: that the session ended normally,
-        and that all records are bit for bit the same when they are computed again.
+        Two expectations are added to those of the scenario: the session must have ended
+        normally, and recomputing all records must give the same bits.
 
         Args:
             log_file: Log of the session, which may be missing.
@@ -233,13 +232,13 @@ def trials(
     >>> [str(trial) for trial in tn.trials("jitter", seeds=[1, 2])]
     ['jitter-seed1', 'jitter-seed2']
 
-    In virtual time, a scenario in which nothing is random has a single trial, with the first of
-    the seeds. All other seeds would give the same run.
+    In virtual time, a scenario in which nothing is random has a single trial, with the first
+    seed, because all other seeds would give the same run.
 
     Args:
-        source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        seeds: Seeds of the random numbers. If empty, the scenario's own seed is used.
-        set: Overrides, as in `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
+        source: Name of a shipped scenario, a path, a TOML string, its tables, or a `Scenario`.
+        seeds: Random seeds. If empty, the scenario's own seed is used.
+        set: Overrides, such as `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
         live: True if the trials will run over a network.
 
     Raises:
@@ -263,7 +262,7 @@ def trials(
 
     overrides = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
     return [
-        Trial(reseed_scenario(scenario, seed), label, overrides, live)
+        Trial(load_scenario(scenario, seed=seed), label, overrides, live)
         for seed in distinct_seeds
     ]
 
@@ -340,10 +339,10 @@ class _ExpectationRow(NamedTuple):
     mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the texts of this expectation's row in the printed table.
+        """Returns the texts of this row in the printed table, one for each of `TRIAL_COLUMNS`.
 
-        There is one text for each of `TRIAL_COLUMNS`, such as the limit, the worst measured
-        value, and the number of runs that met the expectation.
+        They include the limit, the worst measured value, and the number of runs that met the
+        expectation.
         """
         mark = "ok" if self.held == self.runs else "FAIL"
         worst = self.worst
@@ -354,7 +353,7 @@ class _ExpectationRow(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class TrialReport(Result):
-    """Results of several simulations, each compared with the expectations of its scenario.
+    """Results of several trials, each compared with the expectations of its scenario.
 
     Attributes:
         results: The results, in the order of scenarios and seeds.
@@ -366,21 +365,21 @@ class TrialReport(Result):
 
     @property
     def held(self) -> bool:
-        """True if all simulations met all expectations, so that `trilat test` exits with 0."""
+        """True if all trials met all expectations, in which case `trilat test` exits with 0."""
         return all(result.held for result in self.results)
 
     @property
     def scenarios(self) -> dict[str, list[TrialResult]]:
-        """Results of the simulations of each scenario, by its name or path, in their order."""
+        """Maps the name or path of each scenario to the results of its trials, in order."""
         groups: dict[str, list[TrialResult]] = {}
         for result in self.results:
             groups.setdefault(result.trial.source, []).append(result)
         return groups
 
     def rows(self) -> list[_ExpectationRow]:
-        """Combines the results of each scenario to one row per expectation.
+        """Combines the results of each scenario into one row per expectation.
 
-        If some runs of a scenario have no result, another row states their number.
+        If some trials of a scenario have no result, an additional row states their number.
         """
         rows = []
         for name, results in self.scenarios.items():
@@ -414,9 +413,10 @@ class TrialReport(Result):
         return rows
 
     def failures(self) -> list[str]:
-        """Returns lines about the failed runs, with commands that repeat and show each run.
+        """Returns lines on each failed trial, with the commands to repeat and inspect it.
 
-        At most `MAX_FAILURES_SHOWN` runs of a scenario are explained. Empty if no run failed.
+        At most `MAX_FAILURES_SHOWN` trials per scenario are explained. Empty if no trial
+        failed.
         """
         lines = []
         for results in self.scenarios.values():
@@ -436,9 +436,9 @@ class TrialReport(Result):
     def remarks(self) -> list[str]:
         """Returns lines that help to interpret the results of the trials.
 
-        The lines name the scenario keys that were changed for all trials, the scenarios that
-        ran only once because nothing in them is random, the duration and speed of all runs, and
-        the reasons why some of them were not computed side by side.
+        They list the overrides that applied to all trials, the scenarios that ran only once
+        because nothing in them is random, the duration and speed of all runs, and the reasons
+        why some of them were not computed side by side.
         """
         remarks = []
         overrides = self.results[0].trial.overrides if self.results else ()
@@ -465,10 +465,10 @@ class TrialReport(Result):
         return remarks
 
     def table(self) -> list[str]:
-        """Returns the table of expectations as aligned lines, of which the first is the header.
+        """Returns the table of expectations as aligned lines, starting with the header.
 
-        The table has a row per expectation. A column with the means over the runs is added if
-        there are means.
+        The table has one row per expectation. If there are means over the runs, they form an
+        additional column.
         """
         rows = self.rows()
         cells = [row.cells() for row in rows]
@@ -479,10 +479,10 @@ class TrialReport(Result):
         return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat test` prints.
+        """Yields the sections of the report that `trilat test` prints.
 
-        The parts are a table of the expectations and how well the runs met them, the failures,
-        and remarks such as the duration of all runs.
+        The report consists of a table of the expectations and how well the runs met them, the
+        failures, and remarks such as the duration of all runs.
         """
         header, *lines = self.table()
         yield header
@@ -493,7 +493,7 @@ class TrialReport(Result):
         yield from [*self.failures(), *self.remarks()]
 
     def headline(self) -> str:
-        """Returns the number of simulations that met all expectations, as a sentence.
+        """Returns a sentence with the number of trials that met all expectations.
 
         Example: "19 of 20 runs as expected".
         """
@@ -501,7 +501,7 @@ class TrialReport(Result):
         return f"{held} of {count_nouns(len(self.results), 'run')} as expected"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat test --json` prints them.
+        """Converts the results to the plain values that `trilat test --json` prints.
 
         "again" is the command that repeats a run, and "log" the path of its log or null.
         """
@@ -520,9 +520,9 @@ class TrialReport(Result):
         return {"held": self.held, "wall_s": self.wall_s, "runs": runs}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of plain values, one row for each expectation of each run.
+        """Returns a table of plain values, with one row for each expectation of each run.
 
-        A data frame of these rows shows how close the runs came to their limits.
+        Loaded into a data frame, the rows show how close the runs came to their limits.
         """
         return [
             {
@@ -535,11 +535,11 @@ class TrialReport(Result):
         ]
 
     def encode_junit_xml(self, began_unix_ns: int, host: str) -> bytes:
-        """Encodes the results of trials as a JUnit XML document, which build servers display.
+        """Encodes the results as a JUnit XML document, which build servers can display.
 
-        The document follows Jenkins' `junit-10.xsd`. It has a suite per scenario and a case per
-        run. A case has one `failure` with all unmet expectations, or an `error` if the run has
-        no result.
+        The document follows Jenkins' `junit-10.xsd`, with one suite per scenario and one case
+        per run. A case has one `failure` that lists all unmet expectations, or an `error` if
+        the run has no result.
 
         Args:
             began_unix_ns: Start of the trials in Unix time, in ns.
@@ -658,14 +658,12 @@ def run_trials(
 ) -> TrialReport:
     """Runs trials in virtual time and collects their results.
 
-    A trial is a run of a scenario with one random seed, whose result is compared with the
-    expectations of the scenario. If there is a single trial, or `jobs` is 1, no worker process
-    is started.
+    No worker process is started for a single trial, or if `jobs` is 1.
 
     Args:
         batch: The trials.
-        jobs: Number of worker processes. If `None`, all cores are used.
-        done: Function that is called with each result as it arrives.
+        jobs: Number of worker processes. If `None`, one per core.
+        done: Called with each result as it arrives.
         on: Address of a Dask scheduler, or an executor, whose workers run the trials. If
             `None`, they run in processes on this machine.
 
@@ -674,9 +672,9 @@ def run_trials(
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
-    laws = list_imported_code(trial.scenario for trial in batch)
+    laws = list(dict.fromkeys(code for trial in batch for code in trial.scenario.imported_code))
     results: dict[int, TrialResult] = {}
-    with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
+    with WorkerPool.open(jobs, on, most=len(batch), laws=laws) as pool:
         for index, result in _iterate_results(pool, batch):
             # The result names the trial of the batch, and not the copy that a worker received.
             results[index] = result._replace(trial=batch[index])
@@ -741,18 +739,18 @@ def check(
 ) -> TrialReport:
     """Runs a scenario in virtual time, once per seed, and checks its expectations.
 
-    The command is `trilat test`.
+    The command `trilat test` does the same.
 
     >>> tn.check("free", jobs=1).held
     True
 
     Args:
-        source: Name of a shipped scenario, a path, or a scenario.
-        seeds: Seeds of the random numbers. If empty, the scenario's own seed is used.
-        set: Overrides, as in `{"link.delay_ms": 400}`.
-        jobs: Number of worker processes. If `None`, all cores are used.
+        source: Name of a shipped scenario, a path, or a `Scenario`.
+        seeds: Random seeds. If empty, the scenario's own seed is used.
+        set: Overrides, such as `{"link.delay_ms": 400}`.
+        jobs: Number of worker processes. If `None`, one per core.
         on: Workers to use instead of processes on this machine: the address of a Dask
-            scheduler, as in "tcp://10.0.0.5:8786", or an executor.
+            scheduler, such as "tcp://10.0.0.5:8786", or an executor.
 
     Returns:
         The results, if all expectations are met.
@@ -761,8 +759,8 @@ def check(
         ScenarioError: The scenario or an override is not valid, or the scenario has no
             expectations.
         UsageError: The cluster cannot be reached, or a worker does not meet the requirements.
-        AssertionError: An expectation is not met. The text contains the margin and the command
-            that repeats the run.
+        AssertionError: An expectation is not met. The message contains the margin and the
+            command that repeats the run.
     """
     __tracebackhide__ = True  # pytest shows the reason instead of this line
     report = run_trials(trials(source, seeds, set), jobs, on=on)

@@ -1,18 +1,18 @@
-"""Advances several Gymnasium environments together, on the SIMD vector unit of one core.
+"""Steps several Gymnasium environments together, on the SIMD vector unit of one core.
 
-Training a policy needs millions of steps. Processors compute the same operation on several
-numbers at once. Therefore, environments that differ only in numbers are simulated side by side.
-Each has a lane, which is its position in the vector registers. NumPy computes the observations
-and rewards of all environments together.
+Training a policy requires millions of steps. Environments that differ only in numerical
+parameters are therefore simulated side by side with vector instructions. Each environment
+occupies one lane, a position in the vector registers. NumPy computes the observations and
+rewards of all environments together.
 
-Each sub-environment is a `TeleoperationEnv`, which begins its episodes and can draw and save
-them.
+Each sub-environment is a `TeleoperationEnv`, which starts its own episodes and can draw and
+save them.
 
 Invariant:
-    - Observations, rewards and information equal, bit for bit, those that
-      `gymnasium.vector.SyncVectorEnv` returns when the sub-environments are stepped one by one.
-    - A sub-environment whose present episode cannot share the vector instructions is stepped by
-      itself. If this applies to all sub-environments, the attribute `obstacle` states the
+    - Observations, rewards and information are identical, bit for bit, to those that
+      `gymnasium.vector.SyncVectorEnv` returns when it steps the sub-environments one by one.
+    - A sub-environment whose current episode cannot share the vector instructions is stepped on
+      its own. If this applies to all sub-environments, the attribute `obstacle` states the
       reason.
     - If an action is rejected, no sub-environment advances.
 """
@@ -47,17 +47,17 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
     """Several environments in which a policy operates one arm, simulated together for speed.
 
     `make_env(..., num_envs=8)` creates this object. It has the interface of Gymnasium's vector
-    environments: `step` takes one action per environment, and returns one observation each.
+    environments: `step` takes one action per environment and returns one observation for each.
 
     Args:
         env: The first sub-environment. The others are copies of it.
         num_envs: Number of sub-environments.
-        autoreset_mode: When the next episode follows an ended one: "NextStep", "SameStep" or
-            "Disabled", as in Gymnasium.
+        autoreset_mode: When the next episode begins after one has ended: "NextStep", "SameStep"
+            or "Disabled", as in Gymnasium.
 
     Attributes:
-        obstacle: Property because of which sub-environments are stepped one by one. Empty if
-            they are computed side by side.
+        obstacle: Reason why sub-environments are stepped one by one. Empty if they are computed
+            side by side.
 
     Raises:
         UsageError: The number of environments or the mode is not valid.
@@ -99,14 +99,14 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins new episodes in all environments, or in those of `options["reset_mask"]`.
+        """Begins new episodes in all environments, or only where "reset_mask" is True.
 
         Args:
-            seed: Seed of the random numbers of the first environment, to which each further
-                environment adds 1; or a list with one seed per environment. If `None`, the
-                random sequences of earlier episodes continue.
-            options: Overrides for these episodes only, as in `TeleoperationEnv.reset`, and the
-                mask, an array of booleans.
+            seed: Random seed of the first environment, increased by 1 for each further one; or
+                a list with one seed per environment. If `None`, the random sequences of earlier
+                episodes continue.
+            options: Overrides for these episodes only, as in `TeleoperationEnv.reset`, and
+                "reset_mask", an array of booleans.
 
         Returns:
             The observations and the information dictionary.
@@ -119,20 +119,20 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return super().reset(seed=seed, options=options)
 
     def step(self, actions: Any) -> tuple[Any, Array, Flags, Flags, dict[str, Any]]:
-        """Applies an action to each environment, and advances all of them by one step.
+        """Applies one action to each environment and advances all of them by one step.
 
         Args:
             actions: The actions, one per environment.
 
         Returns:
-            The observations; the rewards; for each environment, True if its task was done or
+            The observations; the rewards; for each environment, True if its task succeeded or
             failed, or if an arm left its limits; for each environment, True if the episode
-            ended because of its duration; and the information dictionary of Gymnasium's vector
+            reached its full duration; and the information dictionary of Gymnasium's vector
             environments.
 
         Raises:
             UsageError: An action is not valid. No environment advances.
-            EpisodeError: There is no episode, or it has ended.
+            EpisodeError: No episode has begun, or it has ended.
         """
         is_reset = self._autoreset_envs.copy()
         if self.autoreset_mode == AutoresetMode.DISABLED:
@@ -268,14 +268,14 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls the method `name` of each environment, or reads the attribute of that name.
 
-        The states of the episodes are first written into the environments, because the joint
-        simulation does not update them.
+        The joint simulation does not update the individual environments, so the states of the
+        episodes are first written back to them.
         """
         self._write_back()
         return super().call(name, *args, **kwargs)
 
     def render(self) -> tuple[Any, ...]:
-        """Returns one picture per environment, which shows its arms, as Gymnasium expects."""
+        """Returns one image of the arms per environment, as Gymnasium expects."""
         self._write_back()
         return super().render()
 
@@ -308,17 +308,17 @@ class _Results:
         self.infos: dict[str, Any] = {}
 
     def put_info(self, infos: dict[str, Any], key: str, indices: Any, values: Any) -> None:
-        """Writes one entry of the information dictionary of all environments.
+        """Writes one entry of the information dictionary for all environments.
 
-        Gymnasium stores next to each entry, under its key with a leading "_", an array of
-        booleans: True for the environments that have the entry.
+        For each entry, Gymnasium also stores an array of booleans under the same key with a
+        leading "_", which is True for the environments that have the entry.
 
         Args:
-            infos: The dictionary, or a dictionary in it.
+            infos: The dictionary, or a dictionary nested in it.
             key: Key of the entry.
             indices: Environments to which the values belong, as a NumPy index.
-            values: The values, one per environment, or a dictionary with such values for
-                several entries.
+            values: The values, one per environment, or a dictionary of such values for several
+                entries.
         """
         has_entry = infos.setdefault(f"_{key}", np.zeros(self.count, np.bool_))
         has_entry[indices] = True
@@ -334,12 +334,12 @@ class _Results:
     def put_observations(self, indices: Any, observations: Any, is_all: bool) -> None:
         """Writes the new observations of some environments into the arrays of all environments.
 
-        A vector environment returns the observations of all its environments together, but only
-        some of them may have been simulated in a call.
+        A vector environment always returns the observations of all its environments, but a call
+        may have simulated only some of them.
 
         Args:
-            indices: Indices of the simulated environments, as NumPy accepts them.
-            observations: The observations, an array or arrays by name.
+            indices: Indices of the simulated environments, as a NumPy index.
+            observations: The observations, as an array or as a mapping from name to array.
             is_all: True if these are the observations of all environments.
         """
         if is_all:
@@ -413,7 +413,7 @@ class _LaneEnvs:
     def load(self, is_stepped: Flags) -> None:
         """Starts new episodes in place of those that have ended since the last step.
 
-        Episodes are simulated side by side, each in the place (lane) of its environment.
+        Each episode is simulated in the lane of its environment.
 
         Args:
             is_stepped: True for environments of the vector environment that are to be stepped.
@@ -483,13 +483,13 @@ class _LaneEnvs:
     def step(
         self, actions: Array, exceeds: Flags, is_stepped: Flags, results: _Results
     ) -> None:
-        """Simulates one step of several episodes side by side, and writes the results.
+        """Simulates one step of several episodes side by side and stores the results.
 
         Args:
             actions: Checked actions of all environments of the vector environment.
             exceeds: True for actions that were clipped.
             is_stepped: True for environments that are to be stepped.
-            results: Receives the results.
+            results: Object in which the results are stored.
         """
         count = len(self._envs)
         block = slice(self._first, self._first + count)
@@ -582,9 +582,7 @@ class _LaneEnvs:
         return q if self._is_joint else self.place_end_effectors(self._user, q)
 
     def place_end_effectors(self, i: int, q: Array) -> Array:
-        """Returns the end effector's position of one arm in all episodes, in m.
-
-        The shape is (lanes, 2), with one lane for each episode that is simulated side by side.
+        """Returns the end-effector position of one arm in all episodes, shape (lanes, 2), in m.
 
         Args:
             i: Index of the site.
@@ -642,9 +640,9 @@ class _LaneEnvs:
         }
 
     def write_back(self) -> None:
-        """Copies the states of the episodes in progress into their environments.
+        """Copies the states of the episodes in progress back into their environments.
 
-        The episodes are simulated together in common arrays, but drawn and saved one by one.
+        Episodes are simulated together in common arrays, but drawn and saved one by one.
         """
         for lane, env in enumerate(self._envs):
             is_here = self._is_loaded[lane] and self._runs[lane] is env.run
@@ -667,32 +665,32 @@ class _LaneEnvs:
 
     @property
     def envs(self) -> list[TeleoperationEnv]:
-        """The reinforcement-learning environments whose episodes are simulated side by side."""
+        """The environments whose episodes are simulated side by side."""
         return self._envs
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sites (arm controllers), such as "m1", equal in all environments."""
+        """Site names, such as "m1", which are the same in all environments."""
         return self._names
 
     @property
     def user(self) -> int:
-        """Index of the site (arm controller) whose arm the policy moves."""
+        """Index of the site whose arm the policy moves."""
         return self._user
 
     @property
     def is_joint(self) -> bool:
-        """True if an action is a set of joint angles, and False if it is a position."""
+        """True if an action is a set of joint angles, False if it is a position."""
         return self._is_joint
 
     @property
     def k(self) -> NDArray[np.int64]:
-        """Number of control periods (ticks) that each episode has lasted so far."""
+        """Number of ticks that each episode has lasted so far."""
         return self._steps * self._period
 
     @property
     def rate_hz(self) -> int:
-        """Rate of the control loop of the arm that the policy moves, in Hz."""
+        """Tick rate of the arm that the policy moves, in Hz."""
         return self._rate_hz
 
 
@@ -719,10 +717,7 @@ class _State:
         self._new: list[list[bool]] = []
 
     def read_links(self, name: str, i: int) -> Array:
-        """Returns a quantity of the network links to site `i`, shape (lanes, peers, numbers).
-
-        A lane is one of the episodes that are simulated side by side.
-        """
+        """Returns a quantity of the links to site `i`, shape (lanes, peers, entries)."""
         return np.ascontiguousarray(self._lanes.read_links(name, i).transpose(1, 0, 2))
 
     def _find_view(self) -> dict[str, Array]:
@@ -769,11 +764,11 @@ class _State:
     def build_scene(self, lane: int) -> Scene:
         """Returns the state of one episode in the form that its task accepts.
 
-        A user's task is written for a single environment. Therefore it judges one episode at a
-        time.
+        User-written tasks are designed for a single environment, so they evaluate one episode
+        at a time.
 
         Args:
-            lane: The lane.
+            lane: Lane of the episode.
         """
         env = self._envs.envs[lane]
         user = self._envs.user
@@ -839,7 +834,7 @@ class _ReachTasks:
         self._last_s = np.zeros(count)
 
     def load(self, lane: int, task: ReachTask, site: int) -> None:
-        """Copies the goal and further state of one task into the arrays of all tasks.
+        """Copies the goal and the rest of the state of one task into the arrays of all tasks.
 
         Args:
             lane: Lane of the episode.
@@ -854,14 +849,14 @@ class _ReachTasks:
         self._last_s[lane] = task.last_s
 
     def write_back(self, lane: int, task: ReachTask) -> None:
-        """Copies the state of the task of one episode from the common arrays into the task."""
+        """Copies the state of one episode's task from the common arrays back into the task."""
         task.reached_s = float(self._reached_s[lane])
         task.last_s = float(self._last_s[lane])
 
     def judge(self, state: _State, is_judged: Flags) -> tuple[Array, Flags]:
-        """Computes the rewards of a step in all episodes, and which tasks are done.
+        """Computes the rewards of a step in all episodes, and which tasks are complete.
 
-        The results are those of `ReachTask.judge`.
+        The results equal those of `ReachTask.judge`.
 
         Args:
             state: State after the step.

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import trilat_net
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.errors import ScenarioError
 from trilat_net.presentation.certificate_text import describe_certificate, list_energies
 from trilat_net.presentation.verdict_text import FALSE_RECORDS_TEXT
@@ -56,7 +56,7 @@ def test_every_run_has_a_certificate(
         scenario = load_scenario(name, {"rate_hz": 100, "duration_s": duration_s, **overrides})
     except ScenarioError:
         return
-    certificate = certify_log(trilat_net.simulate(scenario))
+    certificate = Certificate.of_log(trilat_net.simulate(scenario))
     facts = json.loads(json.dumps(certificate.to_dict(), allow_nan=False))
     assert FALSE_RECORDS_TEXT not in facts["text"] or "tells which" in facts["text"]
     assert all(

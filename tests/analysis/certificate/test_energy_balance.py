@@ -30,18 +30,17 @@ from tests.scenario.builders import planar_task_text, six_joint_text
 from tests.theory.delay_equations import DelayEquations, inertia, make_equations
 from tests.theory.energy import compute_balance as balance_by_hand
 from tests.theory.energy import left_null_vector
-from trilat_net.analysis.certificate.certificate_result import Certificate
 from trilat_net.analysis.certificate.energy_balance import (
     EnergyBalance,
     SiteEnergy,
     find_dominance_matrices,
 )
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.dominance_history import DominancePlan
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.core import DominanceRamp
-from trilat_net.presentation.premise_text import explain_no_functional
+from trilat_net.presentation.verdict_text import explain_no_functional
 from trilat_net.scenario import load_scenario, parse_scenario
 
 CAUGHT = 1e-3
@@ -312,7 +311,7 @@ def find_unexplained_share(balance: EnergyBalance) -> float:
 def check_six_joints(duration_s: float) -> LogMetrics:
     """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joint_text(duration_s, 200.0)))
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     metrics = LogMetrics.of_log(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert certificate.balance is not None
@@ -362,7 +361,7 @@ def test_energy_of_ten_seconds_of_six_joints_closes() -> None:
 
 
 def test_premises_name_joints_at_limits_and_at_stops() -> None:
-    certificate = certify_log(make_rough_log())
+    certificate = Certificate.of_log(make_rough_log())
     premises = {premise.name: premise for premise in certificate.premises}
     assert (
         premises["torque"].holds is premises["stops"].holds is premises["hands"].holds is False
@@ -408,7 +407,7 @@ def certify_planar_task(
     rate_hz: int = 1000, elbow_rad: float = 1.7, **overrides: object
 ) -> Certificate:
     text = planar_task_text(rate_hz=rate_hz, elbow_rad=elbow_rad)
-    return certify_log(trilat_net.simulate(parse_scenario(text, overrides=overrides)))
+    return Certificate.of_log(trilat_net.simulate(parse_scenario(text, overrides=overrides)))
 
 
 def find_largest_share(certificate: Certificate, name: str = "residual") -> float:
@@ -465,7 +464,7 @@ def test_the_axis_of_one_arm_dissipates() -> None:
     log = trilat_net.simulate(
         load_scenario("unlike_arms", {"duration_s": 1.0, "sites.s.q0_rad": q0})
     )
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     assert certificate.verdict.finding is StabilityFinding.COVERED, certificate.verdict.text
     assert find_largest_share(certificate) <= BAR
     assert certificate.balance is not None

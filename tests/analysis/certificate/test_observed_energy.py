@@ -17,7 +17,7 @@ from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, ope
 from tests.scenario.builders import make_scenario
 from tests.unit_arm import make_spring_hand, make_unit_scenario
 from trilat_net.analysis.certificate.observed_energy import ObservedEnergy, ObservedFinding
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.run_end import Stability
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual import SimulatedLog
@@ -93,7 +93,7 @@ def test_waves_held_over_an_outage_add_energy() -> None:
     """
     outage = {"links__m->s__outages_s": [[1.8, 3.0]], "sites__m__hands__0__end_s": 2.0}
     log = simulate_clamped_pair.__wrapped__(**outage, duration_s=3.2)
-    certificate = certify_log(log, own_laws=True)
+    certificate = Certificate.of_log(log, own_laws=True)
     assert certificate.observed.finding is ObservedFinding.NEGATIVE
     lowest = min(certificate.observed.least, key=lambda energy: energy.amount_j)
     assert lowest.name == "line m->s"
@@ -127,12 +127,12 @@ def test_own_laws_run_by_request_alone() -> None:
     """A certificate runs the code of a user's law only if its caller requests this."""
     log = SimulatedLog(load_scenario(PAIR, {"duration_s": 0.01}))
     assert ObservedEnergy.of_log(log) is None
-    assert certify_log(log).observed is None
-    assert certify_log(log, own_laws=True).observed is not None
+    assert Certificate.of_log(log).observed is None
+    assert Certificate.of_log(log, own_laws=True).observed is not None
 
 
 def test_the_certificate_reports_it_in_text_and_json() -> None:
-    certificate = certify_log(simulate_clamped_pair(), own_laws=True)
+    certificate = Certificate.of_log(simulate_clamped_pair(), own_laws=True)
     lines = {line.text: line.mark for line in describe_certificate(certificate)}
     assert lines[certificate.observed.text] == "ok"
     observed = certificate.to_dict()["observed"]
@@ -189,9 +189,9 @@ def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
         "sites.s.q0_rad": [0.8, 0.5],
     }
     changes |= {"sites.m.control.K": 0.0, "sites.m.control.B": 0.0}
-    covered = certify_log(SimulatedLog(load_scenario("two_sites", changes)))
+    covered = Certificate.of_log(SimulatedLog(load_scenario("two_sites", changes)))
     assert covered.observed.finding is ObservedFinding.PASSIVE
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         SimulatedLog(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0}))
     )
     assert certificate.observed.finding is ObservedFinding.NEGATIVE

@@ -18,8 +18,8 @@ from tests.analysis.builders import EXPERT, make_run
 from tests.scenario.builders import make_overrides, rough_arm_text
 from trilat_net.analysis import decision_facts, run_end, run_remarks, stability_decision
 from trilat_net.analysis.certificate import (
-    certificate_result,
     energy_balance,
+    functional_judgements,
     observed_energy,
     premise_quantities,
     stability_certificate,
@@ -32,15 +32,13 @@ from trilat_net.analysis.certificate.premise_quantities import (
     PremiseQuantities,
 )
 from trilat_net.analysis.certificate.premises import (
-    check_premises,
-    find_absent_spans,
-    gather_facts,
+    RunFacts,
 )
 from trilat_net.analysis.torque_sources import WallEnergy
 from trilat_net.analysis.twins import envelope_trend
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
-from trilat_net.presentation import decision_text, end_text, premise_text, verdict_text
+from trilat_net.presentation import decision_text, end_text, verdict_text
 from trilat_net.presentation.verdict_text import REQUIREMENTS
 from trilat_net.scenario import load_scenario, parse_scenario
 
@@ -127,7 +125,7 @@ def strings_in(value: object) -> Iterator[str]:
 
 
 def test_each_kind_of_quantities_has_its_sentence() -> None:
-    assert set(premise_text.DESCRIBERS) == set(get_args(PremiseQuantities))
+    assert set(verdict_text.PREMISE_DESCRIBERS) == set(get_args(PremiseQuantities))
 
 
 def list_premise_names() -> set[str]:
@@ -166,9 +164,9 @@ def list_clauses(module: ModuleType) -> set[str]:
 @pytest.mark.parametrize(
     "module",
     [
-        certificate_result,
         decision_facts,
         envelope_trend,
+        functional_judgements,
         observed_energy,
         premise_quantities,
         premises_module,
@@ -188,7 +186,7 @@ def test_judging_modules_have_no_sentence(module: ModuleType) -> None:
 
 def test_sentences_are_recognised() -> None:
     """The name of a source of energy is a key of the JSON output."""
-    assert len(list_clauses(premise_text)) > 20
+    assert len(list_clauses(verdict_text)) > 20
     assert list_clauses(energy_balance) == {"what beta does not cancel"}
 
 
@@ -256,7 +254,7 @@ def simulate_windup(**changes: object) -> Log:
 
 def find_wall_premise(log: Log) -> Premise | None:
     """Returns the premise about sampled walls, or None if a log has no such wall."""
-    premises = check_premises(gather_facts(log))
+    premises = RunFacts.of_log(log).check_premises()
     return next((premise for premise in premises if premise.name == "walls"), None)
 
 
@@ -399,7 +397,7 @@ def test_two_overlapping_absences_are_both_found() -> None:
         events=[SimpleNamespace(about="b", kind="left")],
         scenario=SimpleNamespace(duration_s=5.0),
     )
-    spans = find_absent_spans(log)  # type: ignore[arg-type]
+    spans = AbsentSpan.list_of_log(log)  # type: ignore[arg-type]
     assert spans == [AbsentSpan("a", 1.0, 2.0), AbsentSpan("b", 3.0, 5.0)]
 
 
@@ -417,7 +415,7 @@ def test_sites_may_end_a_tenth_apart() -> None:
             events=[SimpleNamespace(about="b", kind="left")],
             scenario=SimpleNamespace(duration_s=5.0),
         )
-        spans[ticks] = find_absent_spans(log)  # type: ignore[arg-type]
+        spans[ticks] = AbsentSpan.list_of_log(log)  # type: ignore[arg-type]
     assert spans == {48: [AbsentSpan("b", 4.8, 5.0)], 49: [], 50: []}
 
 
@@ -426,10 +424,10 @@ def test_a_stretch_has_only_its_own_delays() -> None:
     change = {"at_s": 1.0, "link": "m1->s", "to": {"delay_ms": 60.0}}
     log = make_run("free", {**SHORT, "timeline": [change]}).log
     absent = AbsentSpan("m2", 0.5, 0.6)
-    facts = gather_facts(log)
+    facts = RunFacts.of_log(log)
     assert facts.functional is not None
     with_absence = facts.functional._replace(absent=[absent])
-    checked = check_premises(facts._replace(functional=with_absence))
+    checked = facts._replace(functional=with_absence).check_premises()
     presence = next(premise for premise in checked if premise.name == "presence")
     assert presence.holds is False
     earlier, later = presence.quantities.stretches  # type: ignore[union-attr]
@@ -440,5 +438,5 @@ def test_a_stretch_has_only_its_own_delays() -> None:
 def test_stops_out_of_reach_satisfy_their_premise() -> None:
     """The elbow is far from its stop during the first tenth of a second."""
     log = trilat_net.simulate(parse_scenario(rough_arm_text(), overrides={"duration_s": 0.1}))
-    checked = {premise.name: premise for premise in check_premises(gather_facts(log))}
+    checked = {premise.name: premise for premise in RunFacts.of_log(log).check_premises()}
     assert checked["stops"].holds is True

@@ -14,7 +14,7 @@ from trilat_net.analysis.certificate.running_energy import (
     RunningEnergy,
 )
 from trilat_net.log.log_reader import Log
-from trilat_net.presentation.premise_text import describe_energy_obstacle
+from trilat_net.presentation.verdict_text import describe_energy_obstacle
 from trilat_net.scenario import load_scenario
 
 BLOCK = 60

@@ -18,7 +18,8 @@ from tests.analysis.builders import (
     make_short_log,
 )
 from tests.log.builders import replace_fields, rewrite_log
-from trilat_net.analysis.certificate.stability_certificate import JUDGEMENTS, certify_log
+from trilat_net.analysis.certificate.functional_judgements import JUDGEMENTS
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.certificate.verdict_facts import (
     RecordGap,
     StabilityFinding,
@@ -35,7 +36,7 @@ GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_every_released_version_is_certified(path: Path) -> None:
-    certificate = certify_log(trilat_net.open_log(path))
+    certificate = Certificate.of_log(trilat_net.open_log(path))
     assert certificate.balance is not None
     assert certificate.verdict.finding in (StabilityFinding.COVERED, StabilityFinding.ROSE)
     assert np.abs(certificate.balance.unexplained).max() <= 1e-3 * certificate.balance.scale
@@ -59,7 +60,7 @@ def test_growth_alone_judges_laws_without_functional(
         "duration_s": 20.0,
         "rate_hz": 100,
     }
-    certificate = certify_log(trilat_net.simulate(load_scenario("free", law)))
+    certificate = Certificate.of_log(trilat_net.simulate(load_scenario("free", law)))
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
         certificate.verdict.text == "V cannot be judged: m1, m2, s: law p_d has no functional V"
@@ -87,7 +88,7 @@ def make_free_log() -> Log:
 
 
 def test_an_arm_with_unknown_theta_has_no_v() -> None:
-    certificate = certify_log(make_arm_external(make_free_log(), known=False))
+    certificate = Certificate.of_log(make_arm_external(make_free_log(), known=False))
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
         certificate.verdict.text
@@ -96,11 +97,11 @@ def test_an_arm_with_unknown_theta_has_no_v() -> None:
 
 
 def test_external_arms_are_judged_with_identified_theta() -> None:
-    as_told = certify_log(make_arm_external(make_free_log(), known=True))
+    as_told = Certificate.of_log(make_arm_external(make_free_log(), known=True))
     assert as_told.verdict.finding is StabilityFinding.COVERED
     assert "no record says who pushes the arm of s" in as_told.verdict.text
     change = lambda s: replace_fields(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s  # noqa: E731
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         make_arm_external(rewrite_log(make_free_log(), change=change), known=True)
     )
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
@@ -110,7 +111,9 @@ def test_external_arms_are_judged_with_identified_theta() -> None:
 
 
 def test_a_record_without_neighbours_is_no_period() -> None:
-    certificate = certify_log(rewrite_log(make_free_log(), lambda state: state.tick % 2 == 0))
+    certificate = Certificate.of_log(
+        rewrite_log(make_free_log(), lambda state: state.tick % 2 == 0)
+    )
     assert certificate.verdict.text == f"V cannot be judged: {RECORD_GAPS[RecordGap.NO_PERIOD]}"
 
 
@@ -122,7 +125,7 @@ def test_a_period_too_long_is_not_judged() -> None:
         "duration_s": 2.0,
         "limits.qd_limit_rad_s": 100.0,
     }
-    certificate = certify_log(trilat_net.simulate(load_scenario("two_sites", light)))
+    certificate = Certificate.of_log(trilat_net.simulate(load_scenario("two_sites", light)))
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
     assert "the period is too long for these gains" in certificate.verdict.text
 
@@ -130,7 +133,7 @@ def test_a_period_too_long_is_not_judged() -> None:
 def test_gaps_are_left_out_and_reported() -> None:
     whole = make_run("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0}).log
     log = rewrite_log(whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240))
-    certificate = certify_log(log)
+    certificate = Certificate.of_log(log)
     assert certificate.balance is not None
     assert certificate.verdict.finding is StabilityFinding.COVERED
     assert certificate.verdict.text.startswith(
@@ -148,7 +151,7 @@ def test_a_gap_does_not_break_the_balance() -> None:
     """Events within a gap are nobody's fault."""
     whole = make_run("free", {"duration_s": 4.0, "rate_hz": 100}).log
     for site in whole.sites:
-        certificate = certify_log(
+        certificate = Certificate.of_log(
             rewrite_log(whole, lambda s, site=site: not (s.site == site and 25 <= s.tick < 225))
         )
         assert certificate.verdict.finding is not StabilityFinding.BROKEN
@@ -156,7 +159,7 @@ def test_a_gap_does_not_break_the_balance() -> None:
 
 def test_an_unfinished_log_is_judged_to_its_end() -> None:
     whole = make_run("free", {"duration_s": 4.0, "rate_hz": 200}).log
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         rewrite_log(whole, lambda state: 200 < state.tick < 700, finished=False)
     )
     assert certificate.balance is not None
@@ -168,7 +171,7 @@ def test_an_unfinished_log_is_judged_to_its_end() -> None:
 
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_nearly_empty_logs_are_reported(ticks: int) -> None:
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         rewrite_log(make_short_log("paper"), lambda state: state.tick < ticks)
     )
     assert (
@@ -180,7 +183,7 @@ def test_nearly_empty_logs_are_reported(ticks: int) -> None:
 
 
 def test_two_records_are_a_period() -> None:
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         rewrite_log(make_short_log("paper"), lambda state: state.tick < 2)
     )
     assert certificate.balance is not None
@@ -207,7 +210,7 @@ def test_sites_of_different_rates_are_booked_together() -> None:
 
 
 def test_a_command_is_booked_like_scripted_changes() -> None:
-    certificate = certify_log(make_busy_run().log)
+    certificate = Certificate.of_log(make_busy_run().log)
     assert certificate.balance is not None
     assert find_relative_residual(certificate.balance) <= 5e-3
     assert certificate.verdict.finding is not StabilityFinding.BROKEN
@@ -216,7 +219,7 @@ def test_a_command_is_booked_like_scripted_changes() -> None:
 def test_an_unreadable_change_is_a_log_error() -> None:
     change = lambda s: replace_fields(s, cmd=["{}"] if s.tick == 5 else [])  # noqa: E731
     with pytest.raises(LogError, match="a command that cannot be read"):
-        certify_log(rewrite_log(make_short_log("paper"), change=change))
+        Certificate.of_log(rewrite_log(make_short_log("paper"), change=change))
 
 
 def judge_unexplained(

@@ -23,8 +23,7 @@ from tests.log.builders import (
 )
 from tests.log.surgery import take_apart
 from tests.scenario.builders import make_overrides
-from trilat_net.analysis.certificate.certificate_result import Certificate
-from trilat_net.analysis.certificate.stability_certificate import certify_log
+from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
 from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.run_end import EndBehaviour, Stability
@@ -41,7 +40,7 @@ def simulate_free(**overrides: object) -> Log:
 
 
 def test_free_motion_is_covered() -> None:
-    free_certificate = certify_log(simulate_free())
+    free_certificate = Certificate.of_log(simulate_free())
     assert free_certificate.verdict.finding is StabilityFinding.COVERED
     assert free_certificate.verdict.text.startswith(
         "covered by the theorem: V did not rise: 29.78 J at 0 s, 12"
@@ -87,7 +86,7 @@ def test_a_rise_names_time_amount_and_cause() -> None:
 
 
 def test_kd_of_different_shape_makes_v_rise() -> None:
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         simulate_free(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
     )
     assert certificate.verdict.finding is StabilityFinding.ROSE
@@ -97,7 +96,7 @@ def test_kd_of_different_shape_makes_v_rise() -> None:
 
 def test_sampling_feeds_a_slow_digital_loop() -> None:
     """T = 0 at 80 Hz: `digital` keeps swinging, because torques are held over a tick."""
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         simulate_free(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0)
     )
     assert certificate.verdict.finding is StabilityFinding.ROSE
@@ -107,7 +106,9 @@ def test_sampling_feeds_a_slow_digital_loop() -> None:
 
 
 def certify_changed(change: Callable[[State], State]) -> Certificate:
-    return certify_log(rewrite_log(simulate_free(rate_hz=500, duration_s=2.0), change=change))
+    return Certificate.of_log(
+        rewrite_log(simulate_free(rate_hz=500, duration_s=2.0), change=change)
+    )
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
@@ -126,7 +127,7 @@ def test_a_changed_record_breaks_its_sites_balance(field: str) -> None:
 def test_changed_records_break_balances_under_varying_delay() -> None:
     log = make_run("free", {**JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         rewrite_log(
             log, change=lambda s: replace_fields(s, q=[x + 0.01 for x in s.q]) if late(s) else s
         )
@@ -136,7 +137,7 @@ def test_changed_records_break_balances_under_varying_delay() -> None:
 
 def test_erased_hands_break_the_balance() -> None:
     log = make_run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
-    certificate = certify_log(
+    certificate = Certificate.of_log(
         rewrite_log(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
     )
     assert certificate.verdict.finding is StabilityFinding.BROKEN
@@ -168,7 +169,7 @@ d = { c = 1.0 }
 
 
 def test_two_closed_groups_are_refused_and_named() -> None:
-    certificate_found = certify_log(trilat_net.simulate(parse_scenario(FOUR)))
+    certificate_found = Certificate.of_log(trilat_net.simulate(parse_scenario(FOUR)))
     assert certificate_found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
         "{a, b} and {c, d} follow no site outside their group: beta is not unique"
@@ -181,8 +182,8 @@ def test_two_closed_groups_are_refused_and_named() -> None:
 def test_groups_made_by_a_change_are_refused() -> None:
     joined = FOUR.replace("c = { d = 1.0 }", "c = { d = 0.5, a = 0.5 }")
     step = '[[timeline]]\nat_s = 1.0\ndominance = "c"\nto = { d = 1.0 }\nramp_s = 0.5\n'
-    assert certify_log(trilat_net.simulate(parse_scenario(joined))).balance is not None
-    certificate = certify_log(trilat_net.simulate(parse_scenario(joined + step)))
+    assert Certificate.of_log(trilat_net.simulate(parse_scenario(joined))).balance is not None
+    certificate = Certificate.of_log(trilat_net.simulate(parse_scenario(joined + step)))
     assert certificate.verdict.finding is StabilityFinding.NOT_JUDGED
 
 
@@ -283,7 +284,7 @@ RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
 
 
 def certify_bytes(data: bytes, **options: float) -> Certificate:
-    return certify_log(open_bytes(data), **options)
+    return Certificate.of_log(open_bytes(data), **options)
 
 
 def test_a_whole_log_is_stable_with_reasons() -> None:

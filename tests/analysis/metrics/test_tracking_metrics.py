@@ -10,8 +10,6 @@ from tests.log.builders import rewrite_log
 from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.dominance_history import DominanceHistory
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.metrics.motion_metrics import measure_undelayed_error
-from trilat_net.analysis.run_view import RunView
 
 RATE_HZ = 200
 
@@ -108,13 +106,13 @@ def test_undelayed_error_keeps_to_common_times() -> None:
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         return {"q": [-t_s if site == "s" else 0.0, 0.0]}
 
-    short = RunView(make_pair_log(motion, seconds=1.0))
-    long = RunView(make_pair_log(motion, seconds=2.0))
-    end_s = short.sites["s"].records.t_s[-1]
-    for view, other, error_rad in ((long, short, end_s), (short, long, end_s)):
-        metrics = measure_undelayed_error(view, "s", other)
-        assert metrics["undelayed_max_rad"].value == pytest.approx(error_rad)
-    assert measure_undelayed_error(long, "s")["undelayed_max_rad"].value > 1.9
+    short = make_pair_log(motion, seconds=1.0)
+    long = make_pair_log(motion, seconds=2.0)
+    end_s = short["s"].t_s[-1]
+    for log, other in ((long, short), (short, long)):
+        maxima = LogMetrics.find_undelayed_maxima(log, ["s"], other)
+        assert maxima["s"] == pytest.approx(end_s)
+    assert LogMetrics.find_undelayed_maxima(long, ["s"])["s"] > 1.9
 
 
 def test_following_uses_the_delay_in_use() -> None:

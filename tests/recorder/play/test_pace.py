@@ -12,7 +12,6 @@ from trilat_net.app.play.player import (
     SPIN_NS,
     LatenessHistogram,
     Pace,
-    parse_rate,
     wait_until,
 )
 from trilat_net.errors import UsageError
@@ -73,7 +72,7 @@ def test_waiting_ends_at_the_deadline_or_at_once(
     [("1", 1.0), ("0.5", 0.5), ("1e3", 1000.0), ("0", math.inf), ("max", math.inf)],
 )
 def test_rates(text: str, rate: float) -> None:
-    assert parse_rate(text) == rate
+    assert Pace.parse_rate(text) == rate
 
 
 @pytest.mark.parametrize("text", ["-1", "nan", "inf", "", "fast", "1e-4", "1001", "1e-300"])
@@ -82,7 +81,7 @@ def test_invalid_rates_are_refused_with_an_example(text: str) -> None:
         UsageError,
         match=r"rate, the speed relative to the recorded run, must be from 0\.001 to 1000, or",
     ):
-        parse_rate(text)
+        Pace.parse_rate(text)
 
 
 @given(st.lists(st.integers(0, (LATENESS_LIMIT_US - 1) * 1000), min_size=1, max_size=50))

@@ -1,20 +1,19 @@
-"""Checks that the energy of each arm, and of all arms together, changes only by known causes.
+"""Checks that the energy of each arm, and of all arms together, changes only for known reasons.
 
-If the records of a run come from the equations that the log states, their energies add up,
-whatever the operators do. This module checks the sums. V_i is the energy function of arm i in
-the stability proof, which `energy_terms` defines. For each arm:
+If the records of a run come from the equations stated in the log, their energies balance,
+whatever the operators do. This module checks the balance. V_i is the energy function of arm i
+in the stability proof, which `energy_terms` defines. For each arm:
 
     V_i - V_i(0) + dissipation + transfer - work = 0
 
-The dissipation is the energy that the controller has removed, and the transfer is the energy
-that the arm has given to the arms that follow it. The work is the energy that operators and
+The dissipation is the energy that the controller has removed, the transfer is the energy that
+the arm has passed to the arms that follow it, and the work is the energy that operators and
 environments have supplied. The transfers cancel in the weighted sum over all arms. The total
 energy function V therefore satisfies
 
     V - V(0) + dissipation - work = 0
 
-The weights beta follow from the dominance factors, the weights with which the arms follow each
-other.
+The weights beta of the arms in this sum follow from the dominance factors.
 
 Invariant:
     - If these sums do not vanish, the records were not produced by the equations that the log
@@ -51,21 +50,21 @@ _EnergyKey = tuple[str, str]
 
 @dataclass(frozen=True)
 class SiteEnergy:
-    """Energy V_i of one arm in the stability proof, and everything that changes it.
+    """Energy V_i of one arm in the stability proof, and every energy flow that changes it.
 
-    There are K records. V_i is the part of arm i in the energy function V of the proof. Its
-    change over each of the K - 1 control periods (ticks) must equal the energies listed here.
-    Otherwise, the records contradict the model.
+    V_i is the share of arm i in the energy function V of the proof. Over each of the K - 1 tick
+    periods, its change must equal the sum of the energies listed here. Otherwise, the records
+    contradict the model.
 
     Attributes:
         motion: Motion of the site, from which its energies are computed.
         parts: The values of V_i, split into its parts.
-        dissipation: Dissipated energy in each period, by kind, such as damping.
-        transfer: Energy in each period that the site gives to its followers, minus the energy
+        dissipation: Dissipated energy in each period, keyed by kind, such as damping.
+        transfer: Energy that the site passes to its followers in each period, minus the energy
             that it receives from the sites that it follows.
-        work: Work on the site in each period, by source, such as the operator.
-        sampling: Work in each period that arises because the continuous control law is executed
-            only once per tick.
+        work: Work on the site in each period, keyed by source, such as the operator.
+        sampling: Work in each period caused by executing the continuous control law only once
+            per tick.
     """
 
     motion: SiteMotion
@@ -79,8 +78,8 @@ class SiteEnergy:
     def judged(self) -> Bools:
         """Marks the tick periods in which all energies come from records, shape (K - 1,).
 
-        In the other periods some motion had to be interpolated, because records are missing.
-        These periods do not count in the energy balance.
+        In all other periods, some motion was interpolated because records are missing. These
+        periods are excluded from the energy balance.
         """
         peer_periods = [peer_motion.known for peer_motion in self.followed.values()]
         known_periods = self.motion.records.known_periods
@@ -90,11 +89,11 @@ class SiteEnergy:
 
     @cached_property
     def residual(self) -> Array:
-        """The change of the site's energy V_i that no energy flow explains, shape (K,), in J.
+        """Change of the site's energy V_i that no energy flow explains, shape (K,), in J.
 
-        It is V_i - V_i(0) + dissipation + transfer - work, with the attributes of this class.
-        Only changes in judged periods are summed. It still contains the work that arises
-        because the control law is executed in ticks, see `unexplained`.
+        The residual is V_i - V_i(0) + dissipation + transfer - work, with the attributes of
+        this class, summed over the judged periods. It still contains the work caused by
+        executing the control law in ticks (see `unexplained`).
         """
         dissipated_energies = [kind.total for kind in self.dissipation.values()]
         work_of_sources = [source.total for source in self.work.values()]
@@ -106,24 +105,20 @@ class SiteEnergy:
 
     @cached_property
     def unexplained(self) -> Array:
-        """Change of the arm's energy that no known energy flow explains, shape (K,), in J.
+        """Change of the arm's energy that has no known cause, shape (K,), in J.
 
-        A site is the process that controls the arm. The value is 0 up to numerical errors if
-        the records obey the model of the arm. A large value means that records are wrong, or
-        that the model is.
-
-        It is `residual` minus the work that arises because the continuous control law is
-        executed only once per tick, a period of the control loop.
+        The value is 0 up to numerical errors if the records obey the model of the arm. A large
+        value means that either the records or the model are wrong. It equals `residual` minus
+        the work caused by executing the continuous control law only once per tick.
         """
         sampling = _accumulate(self.sampling.total, self.judged)
         return self.residual - sampling
 
     @property
     def followed(self) -> dict[str, DelayedPeer]:
-        """The other arms that this arm follows at some time, with their motion as received.
+        """The delayed motion of the peers that this arm follows, keyed by site name.
 
-        An arm is followed if its dominance factor, the weight with which this arm follows it,
-        is ever different from zero.
+        A peer is included if its dominance factor differs from zero at any time.
         """
         alpha = self.motion.dominance.alpha
         peers = self.motion.peers
@@ -136,10 +131,10 @@ class SiteEnergy:
 
     @property
     def largest_age_s(self) -> float:
-        """Largest age of the peers' states that the site used in a tick, in s.
+        """Largest age, in s, of any peer state that the site used.
 
-        The age of a state is the time since the peer sent it, thus the delay that the
-        controller sees. It is 0 if the site never used a state of a peer.
+        The age of a state is the delay that the controller sees: the time since the peer sent
+        the state. It is 0 if the site never used the state of a peer.
         """
         t_s = self.motion.records.t_s
         largest_s = []
@@ -153,9 +148,9 @@ class SiteEnergy:
     def begin_s(self) -> float:
         """Time of the first tick at which the energy V_i of the site can be computed, in s.
 
-        V_i depends on the motion of the other sites since they sent the states that are in use.
-        The first records do not contain this motion. If the motion is not known at any tick,
-        the time is infinite.
+        V_i depends on the motion of the other sites since they sent the states in use, which
+        the first records do not cover. The time is infinite if V_i cannot be computed at any
+        tick.
         """
         known = []
         for peer_motion in self.followed.values():
@@ -172,15 +167,14 @@ class SiteEnergy:
     def uncertainty(self) -> float:
         """Estimated numerical error of the arm's energies, in J.
 
-        A change of energy that is smaller than this error proves nothing. Energies are
-        integrated from records at the ticks (periods of the control loop), and motion between
-        the ticks causes errors.
+        Smaller changes of energy are not significant. The energies are integrated from records
+        at the ticks, and motion between the ticks causes errors.
 
-        The error of the trapezoid rule is estimated from the curvature of the total power. The
-        error of torques that are constant between ticks is estimated from the changes of these
-        torques, times the changes of the filtered error r = qd - v. Here qd is the joint
-        velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged periods, the
-        whole energy counts as uncertain.
+        The error of the trapezoidal rule is estimated from the curvature of the total power.
+        The error due to torques that are constant between ticks is estimated from the changes
+        of these torques, multiplied by the changes of the filtered error r = qd - v, where qd
+        is the joint velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged
+        periods, the entire energy is considered uncertain.
         """
         outflows = [self.transfer, *self.dissipation.values()]
         inflows = list(self.work.values())
@@ -224,7 +218,7 @@ class SiteEnergy:
 
     @classmethod
     def by_site(cls, log: Log) -> "dict[str, SiteEnergy]":
-        """Computes from a log the energy of each arm that the stability proof uses.
+        """Computes the energy of each arm in the stability proof from a log.
 
         An energy function must exist for the control law of every arm.
 
@@ -232,12 +226,12 @@ class SiteEnergy:
             log: The log of the run.
 
         Returns:
-            The energies, by name of the site. Empty if there are no two ticks at which the
+            A mapping from site name to energy. Empty if there are no two ticks at which the
             energies of all sites can be computed.
 
         Raises:
-            LogError: A recorded change of the settings, such as of a dominance factor, is not
-                valid.
+            LogError: The log records an invalid change of the settings, such as of a dominance
+                factor.
         """
         records = AlignedRecords.by_site(log, common=True)
         pasts = {}
@@ -257,20 +251,20 @@ class SiteEnergy:
         pasts: Mapping[str, PeerTrajectory],
         dominance: Callable[[str, Array], DominanceHistory],
     ) -> "dict[str, SiteEnergy]":
-        """Computes the energy of each arm in the stability proof, and all that changes it.
+        """Computes the energy of each arm in the stability proof, and all flows that change it.
 
         An energy function must exist for the control law of every arm.
 
         Args:
-            scenario: The description of the experiment.
-            records: Records of every site, by name.
-            pasts: Motion of every site over time, by name. It must reach back to the time at
-                which the oldest state that a site uses was sent.
-            dominance: Function that returns the dominance factors of a site, the weights with
-                which it follows its peers, at given times in s.
+            scenario: The scenario of the run.
+            records: Records of every site, keyed by site name.
+            pasts: Trajectory of every site, keyed by site name. It must reach back to when the
+                oldest state that a site uses was sent.
+            dominance: Function that returns the dominance factors of a site at given times in
+                s.
 
         Returns:
-            The energies, by name of the site.
+            A mapping from site name to energy.
         """
         energies = {}
         constants = {}
@@ -325,12 +319,12 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
 
 
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns the times at which the energies V_i of all arms are known, in s.
+    """Returns the times at which the energies V_i of all arms are known, shape (T,), in s.
 
-    The times are ticks (control periods) of the arm with the highest tick rate, shape (T,).
+    These are ticks of the arm with the highest tick rate.
 
     Args:
-        energies: Energies of the sites, by name.
+        energies: Energies of the sites, keyed by site name.
     """
     records = [energy.motion.records for energy in energies.values()]
     fastest = max(records, key=lambda site_records: site_records.rate_hz)
@@ -345,23 +339,24 @@ def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """The energy function V of a group of sites over time, and all energies that change it.
+    """The energy function V of a group of sites over time, and all energy flows that change it.
 
-    Energies are given at the T ticks of the fastest site, in J, shape (T,) unless stated
-    otherwise. Dissipation, work and transfer are sums over the judged periods from the first
-    tick on.
+    Energies are given at the T ticks of the fastest site, in J, with shape (T,) unless stated
+    otherwise. Dissipation, work and transfer are accumulated over the judged periods since the
+    first tick.
 
     Attributes:
         t_s: Times of the ticks, in s.
         beta: Weights of the N sites over time, shape (T, N).
-        sites: beta_i V_i, by site.
-        parts: The parts of V by name, summed over the sites.
-        dissipation: Dissipated energy, by kind.
-        work: Work, by source.
-        sampling: Work that arises because the law is executed in ticks. It is not part of the
-            balance, see `unexplained`.
-        transfer: Transferred energy that the weights do not cancel. 0 if the weights are right.
-        judged: True if the period before a tick follows from records alone, shape (T - 1,).
+        sites: beta_i V_i, keyed by site.
+        parts: The named parts of V, each summed over the sites.
+        dissipation: Dissipated energy, keyed by kind.
+        work: Work, keyed by source.
+        sampling: Work caused by executing the law in ticks. It is not part of the balance (see
+            `unexplained`).
+        transfer: Transferred energy that the weights do not cancel. 0 if the weights are
+            correct.
+        judged: True if the period before a tick is determined by records alone, shape (T - 1,).
     """
 
     t_s: Array
@@ -376,9 +371,10 @@ class EnergyBalance:
 
     @cached_property
     def unjudged_spans(self) -> list[tuple[float, float]]:
-        """The spans of time in which V cannot be judged because records are missing.
+        """Time spans in which V cannot be judged because records are missing.
 
-        Each has a start and an end, in s. The list is empty if V can be judged all the time.
+        Each span is a pair of start and end, in s. The list is empty if V can be judged
+        throughout.
         """
         # Judged periods before and after the run give each span a start and an end.
         padded = np.concatenate([[True], self.judged, [True]])
@@ -390,21 +386,20 @@ class EnergyBalance:
 
     @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The total energy of the arms in the stability proof over time, shape (T,), in J.
+        """Total energy V of the arms in the stability proof, shape (T,), in J.
 
-        V = sum_i beta_i V_i, where V_i is the energy of site i, and beta_i its entry of `beta`.
-        The theorem says that V never rises, unless an operator supplies energy.
+        V = sum_i beta_i V_i, where V_i is the energy of site i, and beta_i its weight in
+        `beta`. According to the theorem, V never rises unless an operator supplies energy.
         """
         return _sum(self.parts)
 
     @cached_property
     def residual(self) -> Array:
-        """The part of the change of V that no known energy explains, shape (T,), in J.
+        """Change of V that no energy flow explains, shape (T,), in J.
 
-        The residual is V - V(0) + dissipation - work, summed over the judged periods, which are
-        those that rest on records alone. Apart from the work of sampling, which it includes,
-        the residual should be close to 0. A large residual shows that the records contradict
-        each other.
+        The residual is V - V(0) + dissipation - work, summed over the judged periods (those
+        determined by records alone). It includes the work of sampling, and should otherwise be
+        close to 0. A large residual shows that the records contradict each other.
         """
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
@@ -412,25 +407,24 @@ class EnergyBalance:
 
     @cached_property
     def unexplained(self) -> Array:
-        """Change of the group's energy that no known energy flow explains, shape (T,), in J.
+        """Change of the group's energy that has no known cause, shape (T,), in J.
 
-        A group consists of arms that follow each other. A large value means that the log
-        contradicts the model of the arms, or that records are wrong.
+        A large value means that the log contradicts the model of the arms, or that records are
+        wrong.
 
-        It is `residual` minus two known causes: the work that arises because control laws are
-        executed in ticks (periods of the control loop), and the energy transfers between arms
-        that the weights of the sites do not cancel.
+        It equals `residual` minus two known causes: the work caused by executing control laws
+        in ticks, and the energy transfers between arms that the site weights do not cancel.
         """
         explained = self._accumulate_judged(self.sampling - self.transfer)
         return self.residual - explained
 
     @cached_property
     def unsupplied(self) -> Array:
-        """The energy V without the work of operators and environments, shape (T,), in J.
+        """The energy V excluding the work of operators and environments, shape (T,), in J.
 
-        The result starts at V(0). From then on, only changes in judged periods count, and the
-        work of operators, environments and the stops of joints is subtracted. If the conditions
-        of the stability theorem hold, it never rises.
+        The curve starts at V(0) and accumulates only changes in judged periods, minus the work
+        of operators, environments and joint stops. It never rises if the conditions of the
+        stability theorem hold.
         """
         rise = self._accumulate_judged(self.V - self.external_work)
         unsupplied: Array = self.V[0] + rise
@@ -450,30 +444,30 @@ class EnergyBalance:
 
     @property
     def external_work(self) -> Array:
-        """Work of operators, walls and end stops on all arms since the first tick, in J.
+        """Work of operators, walls and joint stops on all arms since the first tick, in J.
 
         The stability proof permits the energy V to rise by this amount. The shape is (T,), with
-        one entry per tick (control period).
+        one entry per tick.
         """
         return _sum(self._work_from_outside)
 
     @property
     def external(self) -> dict[str, Array]:
-        """Work of each external source that did any work, by its name, shape (T,), in J.
+        """Work of each external source, shape (T,), in J, keyed by the name of the source.
 
-        The sources are the operators, the environments and the mechanical stops of joints. The
-        text of the certificate names them.
+        The sources are the operators, the environments and the mechanical joint stops. Sources
+        that did no work are left out. The report of the certificate names them.
         """
         sources = self._work_from_outside
         return {name: work for name, work in sources.items() if work.any()}
 
     @cached_property
     def scale(self) -> float:
-        """The size of the energies in the balance, in J, with which its errors are compared.
+        """Scale of the energies in the balance, in J, to which its errors are compared.
 
         The scale is the largest magnitude that the total energy V, or the work of any source,
-        reaches during the run. An error of 1 mJ is negligible for a scale of 100 J, but not for
-        a scale of 1 mJ.
+        reaches during the run. An error of 1 mJ is negligible on a scale of 100 J, but not on a
+        scale of 1 mJ.
         """
         largest = []
         for energy in [self.V, *self.work.values()]:
@@ -489,13 +483,13 @@ class EnergyBalance:
         """Finds the largest rise of the energy function V above an earlier minimum.
 
         The work of operators and environments is subtracted first, because V may rise by this
-        amount. The sources of the remaining energy are also found.
+        amount. The result also names the sources of the remaining energy.
 
         Args:
-            tolerance: Size that the rise must exceed, in J.
+            tolerance: Threshold that the rise must exceed, in J.
 
         Returns:
-            The rise. `None` if it does not exceed the tolerance.
+            The rise, or `None` if it does not exceed the tolerance.
         """
         V = self.unsupplied
         rise = rise_above_minimum(V)
@@ -532,17 +526,16 @@ class EnergyBalance:
     def find_unsupplied_growth(self, tolerance: float) -> list[UnsuppliedGrowth]:
         """Finds rises of the energy V that no source supplied, although the run looks stable.
 
-        V is the energy function of the stability proof, from which the work of operators and
-        environments is subtracted here. Two rules are checked. First, V must not end above its
-        beginning. Second, only the second half of the run is considered: the rise from the
-        minimum to the end must be at most half of the fall from the beginning of this half to
-        the minimum.
+        The work of operators and environments is first subtracted from V, the energy function
+        of the stability proof. Two rules are then checked. First, V must not end higher than it
+        started. Second, in the second half of the run, the rise from the minimum to the end
+        must be at most half of the fall from the beginning of this half to the minimum.
 
         Args:
-            tolerance: Size that a rise must exceed to count, in J.
+            tolerance: Threshold that a rise must exceed to count, in J.
 
         Returns:
-            The growth for each rule that is violated.
+            The growth for each violated rule.
         """
         V = self.unsupplied
         middle_row = len(V) // 2
@@ -565,7 +558,7 @@ class EnergyBalance:
     def of_energies(
         cls, energies: Mapping[str, SiteEnergy], *, paper_weights: bool = False
     ) -> "EnergyBalance":
-        """Adds up the energies of several sites to the energy balance of the group.
+        """Combines the energies of several sites into the energy balance of the group.
 
         The sites are weighted such that the energies that they transfer to each other cancel in
         the sum.
@@ -574,7 +567,7 @@ class EnergyBalance:
             energies: Energies of the sites in scenario order. No site may follow a site outside
                 the group.
             paper_weights: True to give all sites the same weight, as in the paper on which the
-                control law is based. The transferred energies may then fail to cancel, in which
+                control law is based. The transferred energies then may not cancel, in which
                 case the balance does not close.
         """
         times = find_common_times(energies)
@@ -616,14 +609,14 @@ class EnergyBalance:
         all_judged = bool(judged.all())
 
         def select(kind: str) -> dict[str, Array]:
-            """Returns energies of one kind, such as dissipation, summed over judged periods.
+            """Accumulates energies of one kind, such as dissipation, over the judged periods.
 
             Args:
                 kind: The kind, such as "dissipation" or "work".
 
             Returns:
-                The energies over the judged periods, in J, by name, such as "damping". Each
-                starts with 0.
+                Accumulated energies in J, starting with 0, each keyed by a name such as
+                "damping".
             """
             selected = {}
             for (group, name), energy in sums.items():
@@ -672,7 +665,7 @@ def _weigh_site(
     weight_after_step = weight[1:]
 
     def weigh(increment: Increment) -> Array:
-        """Returns the sum over time of an energy, times the weight of the site."""
+        """Returns the accumulated energy over time, multiplied by the weight of the site."""
         at_start = weight_at_start * increment.left
         at_end = weight_at_end * (increment.right + increment.jump)
         return _accumulate(at_start + at_end)
@@ -743,12 +736,12 @@ def _trace_weights(
     def compute_beta(t_s: Array, ahead_s: float) -> Array:
         """Computes the weights beta of the arms in the energy V from the dominance factors.
 
-        Dominance factors seldom change. Therefore the weights of a matrix of factors are
-        computed once and kept in `beta_by_matrix`.
+        Dominance factors seldom change, so the weights for each matrix of factors are computed
+        once and cached in `beta_by_matrix`.
 
         Args:
             t_s: Times, shape (T,), in s.
-            ahead_s: Time, in s, that is added to `t_s` before the factors are evaluated.
+            ahead_s: Time added to `t_s` before the factors are evaluated, in s.
 
         Returns:
             The weights, shape (T, N) for N sites. All are 1 if the paper's weights are
@@ -823,13 +816,13 @@ def _interpolate_dominance(
 
 
 def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Finds all matrices of dominance factors that were in force during a run.
+    """Finds all matrices of dominance factors that were in effect during a run.
 
     Entry (i, j) is the weight with which site i follows site j. If the factors change gradually
     along a ramp, only the matrices at the ends of the ramp are returned.
 
     Args:
-        energies: Energies of the N sites, by name.
+        energies: Energies of the N sites, keyed by site name.
 
     Returns:
         The M matrices, shape (M, N, N).
@@ -855,8 +848,8 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
 def rise_above_minimum(values: Array) -> Array:
     """Returns how far a quantity is above its smallest earlier value, at each time.
 
-    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. In this way, an earlier fall of an
-    energy does not hide a later rise.
+    For example, the values 3, 1, 2, 0 give 0, 0, 1, 0. An earlier fall of an energy thus does
+    not hide a later rise.
 
     Args:
         values: Values of the quantity over time, shape (T,).

@@ -1,17 +1,16 @@
 """Evaluates the energy of an arm in the stability proof, and all terms that change it.
 
-A site is the process that runs one arm. Site i follows its peer j with the weight alpha_ij, its
-dominance factor. It uses samples, which are delayed states that the peer sent. The energy of
-site i in J is
+Site i follows its peer j with the dominance factor alpha_ij, using delayed samples that the
+peer sent. The energy of site i in J is
 
     V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e
                 + sum_j alpha_ij int qd_j' Kd qd_j ds )
 
-Here ' means transposed. The error e is the difference between the joint angles and those that
-the site follows, and ed its derivative. The filtered error is r = qd + Lambda e, with the joint
+where ' means transposed. The error e is the difference between the joint angles and their
+reference, and ed its derivative. The filtered error is r = qd + Lambda e, with the joint
 velocities qd (qd_i for site i). M is the inertia matrix of the arm, theta its dynamic
 parameters, and theta_hat their estimates. Gamma, Lambda, Kp and Kd are gains. The integral runs
-over the time s, from the time at which the sample in use was sent until now.
+over the time s, from when the sample in use was sent until now.
 
 With |x|^2 = x'Kd x and the delay T from peer j, the derivative without external torques is
 
@@ -19,15 +18,15 @@ With |x|^2 = x'Kd x and the delay T from peer j, the derivative without external
               - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2
 
 The first line dissipates energy. The second line transfers energy between sites, and cancels in
-a suitably weighted sum over all sites. In task space, e and qd_j concern the end effectors.
+a suitably weighted sum over all sites. In task space, e and qd_j refer to the end effectors.
 docs/theory/certificate-energy.md explains the derivation.
 
-Each term is integrated over a tick period by the trapezoid rule. At the end of the period e
-jumps to the value of the next sample. The energy of this jump is computed exactly.
+Each term is integrated over a tick period with the trapezoidal rule. At the end of the period,
+e jumps to the value of the next sample. The energy of this jump is computed exactly.
 
 Invariant:
     - The work of operators and environments is computed with r instead of qd, because the
-      theorem requires that they are passive with respect to r.
+      theorem requires them to be passive with respect to r.
     - A site has an energy function only if it uses the adaptive law and theta is known.
 """
 
@@ -70,27 +69,27 @@ _GAIN_NAMES = (
 
 
 class SiteConstants(NamedTuple):
-    """Gains, limits and arm parameters of a site, as the energy function V_i needs them.
+    """Gains, limits and arm parameters of a site that enter the energy function V_i.
 
     Vectors per joint have the shape (n,), and vectors per arm parameter (P,). In task space,
-    where a site follows with its end effector, vectors per coordinate of the task have the
-    shape (m,). The module's docstring defines r, e, ed and the gains.
+    vectors per task coordinate have the shape (m,). The docstring of the module defines r, e,
+    ed and the gains.
 
     Attributes:
         arm: The arm with its true parameters.
         Lambda: Gain of the error e, in 1/s. Per coordinate in task space.
         Kp: Gain of the filtered error r, in N m s/rad.
         Kd: Gain of ed, in N m s/rad. In task space per coordinate, in N s/m.
-        Gamma: Gains of the adaptation of the estimates.
+        Gamma: Adaptation gains of the estimates.
         low: Lower limits of the estimates.
         high: Upper limits of the estimates.
         tau_limit: Largest torque of a joint, in N m, shape () or (n,).
-        axes: For each coordinate of the task, 1 if the site follows along it, else 0. Lambda
-            and Kd are then 0 too. Empty in joint space.
+        axes: For each coordinate of the task, 1 if the site follows along it, else 0. In the
+            latter case, Lambda and Kd are also 0. Empty in joint space.
         rho: Largest robust torque of each joint, an additional torque against r, in N m. 0 if
             the law has none.
         width: Value of r at which the robust torque is 0.71 of the largest, in rad/s.
-        friction: Fraction of the joints' friction that the law compensates.
+        friction: Fraction of the joint friction for which the law compensates.
         tau_rate: Largest rate of the torque of a joint, in N m/s, shape () or (n,).
     """
 
@@ -112,17 +111,17 @@ class SiteConstants(NamedTuple):
     def theta(self) -> Array:
         """True dynamic parameters of the arm, shape (P,), which the control law tries to learn.
 
-        They combine masses, inertias and lengths of the links. The stability proof measures how
-        far the learnt parameters are from the true ones.
+        They combine masses, inertias and lengths of the links. The stability proof uses the
+        difference between the learnt and the true parameters.
         """
         return self.arm.theta
 
     @property
     def weighing_Kd(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The damping gain Kd, which determines the weight of the site in the total energy.
+        """Damping gain Kd, which determines the weight of the site in the total energy.
 
-        Its shape is (m,) for m coordinates. It is NaN along axes that the site does not follow,
-        where Kd has no effect.
+        The shape is (m,) for m coordinates. Kd is NaN along axes that the site does not follow,
+        where it has no effect.
         """
         if not self.axes:
             return self.Kd
@@ -130,13 +129,13 @@ class SiteConstants(NamedTuple):
         return np.where(is_free, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
-        """Returns the robust torque, an extra term of the control law besides its damping Kp r.
+        """Returns the robust torque, which the control law adds to its damping Kp r.
 
-        It limits the effect of disturbances that the law's adaptation cannot learn, such as
+        It limits the effect of disturbances that the law cannot learn by adaptation, such as
         noise.
 
         Args:
-            r: Filtered errors, velocity errors plus a multiple of the position errors, shape
+            r: Filtered errors (velocity errors plus a multiple of the position errors), shape
                 (K, n), in rad/s.
 
         Returns:
@@ -147,10 +146,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def unknown_friction(self) -> Array:
-        """Fraction of each joint's friction that the law does not compensate, shape (n,).
+        """Fraction of each joint's friction for which the law does not compensate, shape (n,).
 
-        It is 0 for a joint without friction. Uncompensated friction does work that the energy
-        balance must contain, and an adaptive law cannot learn it.
+        The fraction is 0 for a joint without friction. The energy balance must include the work
+        of this friction, which an adaptive law cannot learn.
         """
         joints = len(self.Kp)
         unit_speeds = np.ones((1, joints))
@@ -161,22 +160,22 @@ class SiteConstants(NamedTuple):
 
     @property
     def adapts(self) -> Bools:
-        """Marks the parameters of the arm that the law learns while it runs, shape (P,).
+        """Marks the arm parameters that the law learns during the run, shape (P,).
 
-        These are the parameters with a positive adaptation gain Gamma. The others keep the
-        value that the scenario gives them.
+        These are the parameters with a positive adaptation gain Gamma. The others keep their
+        values from the scenario.
         """
         return self.Gamma > 0.0
 
     @classmethod
     def derive(cls, scenario: Scenario, site: str) -> "SiteConstants":
-        """Collects the gains, limits and arm parameters of one arm from the scenario.
+        """Collects the gains, limits and arm parameters of one site from the scenario.
 
-        The arm must have the adaptive control law, and its parameters must be known.
+        The arm must use the adaptive control law, and its parameters must be known.
 
         Args:
-            scenario: The description of the experiment, which defines the gains.
-            site: Name of the site, the process that runs one arm.
+            scenario: The scenario, which defines the gains.
+            site: Name of the site.
         """
         arm = build_arm_rows(scenario, site)
         gains = scenario.gains(site)
@@ -238,22 +237,21 @@ class _PeriodEnds(NamedTuple):
 
 @dataclass(frozen=True)
 class SiteMotion:
-    """The recorded motion of a site, and everything that acts on it, over K records.
+    """The recorded motion of a site over K records, and everything that acts on it.
 
-    A site is the process that runs one arm, and its peers are the sites that it follows. All
-    energies of the site are computed from this object.
+    All energies of the site are computed from this object.
 
     Attributes:
         records: Records of the site.
         constants: Gains and limits of the site, and its arm.
-        dominance: Dominance factors, the weights with which the site follows its peers.
-        peers: The motion of the peers as the site receives them, in the order of the dominance
+        dominance: Dominance factors of the site.
+        peers: Motion of the peers as received by the site, in the order of the dominance
             factors.
-        torque: External torque on the arm, by source.
+        torque: External torque on the arm, divided into operator and environment.
         scheme: Whether the controller holds the torque of a tick until the next tick, or
             extrapolates it.
-        common: 1 for each coordinate in which all sites follow others, and 0 for each other
-            coordinate. Empty if all sites follow others in all coordinates.
+        common: 1 for each coordinate that all sites follow, and 0 for the others. Empty if all
+            sites follow all coordinates.
     """
 
     records: AlignedRecords
@@ -268,8 +266,8 @@ class SiteMotion:
     def following(self) -> Following:
         """Converter from errors between the arms to motion and torque of this arm's joints.
 
-        Arms that follow each other with their end effectors need a different conversion than
-        arms that follow joint by joint.
+        The conversion differs between arms that follow joint by joint and arms that follow with
+        their end effectors.
         """
         records = self.records
         c = self.constants
@@ -277,11 +275,10 @@ class SiteMotion:
 
     @cached_property
     def r(self) -> Array:
-        """The filtered error r (sliding variable) of the site, shape (K, n), in rad/s.
+        """Filtered error r (sliding variable) of the site, shape (K, n), in rad/s.
 
-        It is the velocity of the joints minus the reference velocity. If the site follows joint
-        by joint, it is r = qd + Lambda e, with the joint velocity qd, the synchronisation error
-        e and the gain Lambda in 1/s.
+        This is the joint velocity minus the reference velocity. In joint space r = qd + Lambda
+        e, with the joint velocity qd, the synchronisation error e and the gain Lambda in 1/s.
         """
         records = self.records
         all_rows = slice(None)
@@ -290,11 +287,11 @@ class SiteMotion:
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The direction in which the adaptive law changes its P estimates at each of K ticks.
+        """Direction Y'r in which the adaptive law changes its estimates, shape (K, P).
 
-        It is Y'r with the shape (K, P). Y is the regressor, which yields torques when
-        multiplied by the dynamic parameters, and Y' its transpose. The filtered error r is the
-        joint velocity minus the reference velocity.
+        Y is the regressor, which yields torques when multiplied by the P dynamic parameters,
+        and Y' its transpose. The filtered error r is the joint velocity minus the reference
+        velocity.
         """
         records = self.records
         all_rows = slice(None)
@@ -309,11 +306,11 @@ class SiteMotion:
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The direction in which the law changed its P estimates in each of K - 1 tick periods.
+        """Direction Y'r in which the law changed its estimates in each tick period.
 
-        It is Y'r, where Y is the regressor of the arm's dynamics, Y' its transpose, and r the
-        filtered error. Y'r is taken at the start of the period or averaged over its ends, as
-        the law did. The shape is (K - 1, P).
+        Y is the regressor of the arm's dynamics, Y' its transpose, and r the filtered error.
+        Y'r is evaluated at the start of the period or averaged over its ends, in the same way
+        as the law did. The shape is (K - 1, P).
         """
         if self.scheme is Scheme.DIGITAL:
             return self.Yr[:-1]
@@ -322,16 +319,16 @@ class SiteMotion:
         return 0.5 * (Yr_left + Yr_right)
 
     def law_torque(self, rows: Ints) -> Array:
-        """Returns the torque that the control law demands, before it is limited.
+        """Returns the torque that the control law demands, before limits are applied.
 
-        The torque is computed again from the records. A difference from the recorded torque
-        shows that the records are false, or that the torque was cut off.
+        The torque is recomputed from the records. If it differs from the recorded torque, the
+        records are false or the torque was limited.
 
         Args:
             rows: Rows of the records at which the law is evaluated, shape (K,).
 
         Returns:
-            Torque, shape (K, n) for n joints, in N m.
+            Torque, shape (K, n), in N m.
         """
         return self.control_torque(
             rows,
@@ -349,9 +346,9 @@ class SiteMotion:
     ) -> Array:
         """Returns the torque that the control law would demand for given errors.
 
-        Pose and parameter estimates are taken from the records. The errors may differ from the
-        recorded ones. For example, this gives the torque just before a new sample of a peer was
-        used.
+        Pose and parameter estimates are taken from the records, but the errors may differ from
+        the recorded ones. This gives, for example, the torque just before a new sample of a
+        peer was used.
 
         Args:
             rows: Rows of the records whose pose and estimates are used, shape (K,).
@@ -360,7 +357,7 @@ class SiteMotion:
             r: Filtered errors, shape (K, n), in rad/s.
 
         Returns:
-            Torque before it is limited, shape (K, n), in N m.
+            Torque before limits are applied, shape (K, n), in N m.
         """
         records = self.records
         c = self.constants
@@ -383,11 +380,11 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """Marks the records in which the site brings its arm to rest, or did so shortly before.
+        """Marks the records at which the arm comes to rest, or did so shortly before.
 
-        The site then adds a braking torque, for example because a peer is silent. The recorded
-        torque may therefore differ from the torque of the control law, and must not be compared
-        with it. The shape is (K,).
+        While its arm comes to rest, the site adds a braking torque, for example because a peer
+        is silent. The recorded torque may therefore differ from the torque of the control law
+        and must not be compared with it. The shape is (K,).
         """
         records = self.records
         if records.rests.size:
@@ -398,8 +395,8 @@ class SiteMotion:
     def torque_bounds(self) -> tuple[Array, Array]:
         """Smallest and largest torque that the limits permit in each record, in N m.
 
-        The torque limit applies to every record. The rate limit additionally bounds the
-        difference from the torque of the previous record.
+        The torque limit applies to every record. The rate limit also bounds the change from the
+        torque of the previous record.
 
         Returns:
             Lower and upper bounds, each of shape (K, n).
@@ -426,11 +423,11 @@ class SiteMotion:
 
     @cached_property
     def limited(self) -> Bools:
-        """Marks each recorded torque that is at a limit of the joint, shape (K, n).
+        """Marks each recorded torque that reaches a limit of its joint, shape (K, n).
 
-        The limit is the largest torque, or the largest change of the torque per tick. At a
-        limit, the arm may have received less than the control law demanded, contrary to a
-        premise.
+        The limit is either the largest torque or the largest change of torque per tick. At a
+        limit, the arm may have received less torque than the control law demanded, which
+        violates a premise.
         """
         low, high = self.torque_bounds
         c = self.constants
@@ -445,13 +442,13 @@ class SiteMotion:
 
     @cached_property
     def ends(self) -> _PeriodEnds:
-        """The state of the site at the start and the end of every tick period.
+        """State of the site at the start and end of every tick period.
 
-        The reference is the motion that the site follows: the delayed motions of its peers,
-        weighted with the dominance factors. Within a period the delays are taken as constant,
-        and the reference moves smoothly. At the end of the period it jumps to its next recorded
-        value. If samples of a peer stop arriving, the rule for silent peers determines the
-        reference instead. Then its recorded velocity is integrated by the trapezoid rule.
+        The reference is the mean of the delayed peer motions, weighted with the dominance
+        factors. Within a period, the delays are assumed constant, and the reference moves
+        smoothly. At the end of the period it jumps to its next recorded value. If samples of a
+        peer stop arriving, the rule for silent peers determines the reference instead. In that
+        case its recorded velocity is integrated with the trapezoidal rule.
         """
         records = self.records
         dominance = self.dominance
@@ -517,12 +514,11 @@ class SiteMotion:
     def evaluate_functional(self) -> "FunctionalParts":
         """Computes the energy V_i of a site in the stability proof at each of its K records.
 
-        The module's docstring has the equation. The parts are returned separately, because
-        figures and the certificate show them.
+        See the docstring of the module for the equation.
 
         Returns:
-            Four parts of the energy: of the filtered error, of the parameter estimates, of the
-            synchronisation error, and of the delay.
+            The four parts of the energy (filtered error, parameter estimates, synchronisation
+            error and delay), which figures and the certificate show separately.
         """
         records = self.records
         c = self.constants
@@ -552,20 +548,20 @@ class SiteMotion:
     def compute_dissipation(self) -> "dict[str, Increment]":
         """Computes the energy that the controller of a site dissipates in each tick period.
 
-        The result has these kinds of energy:
+        The kinds of energy are:
 
-        - damping: the work of the damping and of the robust torque, which both act against the
+        - damping: the work of the damping and of the robust torque, which both oppose the
           filtered error r.
         - disagreement: half the squared difference between the velocity of the site and the
           delayed velocity of each peer, weighted with the dominance factor of the peer and the
           gain Kd.
         - friction, if the joints have any: the work r'(friction(qd) - friction(qd - r)), with
           the joint velocities qd.
-        - open axes: the energy that the site gives to others along the axes of space that not
-          all sites follow. It is missing if all sites follow along all axes.
+        - open axes: the energy that the site passes to others along axes that not all sites
+          follow. It is missing if all sites follow all axes.
 
         Returns:
-            The energies, by kind.
+            A mapping from kind to energy.
         """
         records = self.records
         c = self.constants
@@ -588,12 +584,12 @@ class SiteMotion:
             right = right + half_alpha_right * squared_right
 
         def damping_power(r: Array) -> Array:
-            """Returns the power that the damping of the control law dissipates, in W."""
+            """Returns the power dissipated by the damping of the control law, in W."""
             torque = c.Kp * r + c.robust_torque(r)
             return _dot_rows(r, torque)
 
         def friction_power(r: Array, qd: Array) -> Array:
-            """Returns the power that uncompensated friction dissipates, in W."""
+            """Returns the power dissipated by uncompensated friction, in W."""
             friction = c.arm.friction(qd)
             torque = friction - c.arm.friction(qd - r)
             return _dot_rows(r, torque)
@@ -617,17 +613,16 @@ class SiteMotion:
         return dissipation
 
     def compute_transfer(self, axes: Array) -> "Increment":
-        """Computes the energy that a site gives to sites which follow it, minus what it gets.
+        """Computes the energy that a site passes to its followers, minus what it receives.
 
-        It is the given energy minus the received energy: in each tick period the integral of
-        1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd qd_j. Here qd_i is the velocity of the
-        site and qd_j of its peer j, Kd is the damping gain, and alpha_ij is the dominance
-        factor: the weight with which site i follows peer j. In the weighted sum over all sites
-        these energies cancel.
+        In each tick period this is the integral of 1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij
+        qd_j'Kd qd_j, where qd_i is the velocity of the site, qd_j that of its peer j, Kd the
+        damping gain, and alpha_ij the dominance factor. These energies cancel in the weighted
+        sum over all sites.
 
         Args:
-            axes: 1 for each of the m coordinates to include, and 0 for each other coordinate,
-                shape (m,). The shape () applies to all coordinates.
+            axes: 1 for each of the m coordinates to include, and 0 for the others, shape (m,).
+                A scalar, shape (), applies to all coordinates.
         """
         dominance = self.dominance
         Kd_of_axes = axes * self.constants.Kd
@@ -647,8 +642,9 @@ class SiteMotion:
     def compute_work(self) -> "dict[str, Increment]":
         """Computes the work on a site in each tick period, by source.
 
-        The sources are all effects that may raise the site's energy function V_i, except the
-        transfer between sites: operators, environments, links, changes and limits.
+        The sources are all effects that can raise the site's energy function V_i, other than
+        the transfer between sites: operators, environments, links, changes of settings, and
+        limits.
         """
         torque = self.torque
         records = self.records
@@ -678,13 +674,14 @@ class SiteMotion:
     def compute_torque_work(self, now: Array, held: Array) -> "Increment":
         """Computes the work of an external torque on the arm in each tick period.
 
-        In the stability proof, a torque does work on the filtered error r instead of the joint
-        velocity. The work is the integral of r' times the torque.
+        As in the stability proof, the work is the integral of r' times the torque: the filtered
+        error r takes the place of the joint velocity.
 
         Args:
-            now: Part of the torque that follows the motion continuously, shape (K, n), in N m.
-            held: Part of the torque that is computed once per tick and held, shape (K, n), in N
-                m.
+            now: Component of the torque that follows the motion continuously, shape (K, n), in
+                N m.
+            held: Component of the torque that is computed once per tick and held, shape (K, n),
+                in N m.
         """
         torque_left = now[:-1] + held[:-1]
         torque_right = now[1:] + held[:-1]
@@ -693,16 +690,16 @@ class SiteMotion:
         return _trapezoid(self, power_left, power_right)
 
     def compute_link_work(self, j: int) -> "Increment":
-        """Returns the work of the link from peer j: the change of V_i as the age jumps.
+        """Returns the work of the link from peer j: the change of V_i when the age jumps.
 
-        At the end of a period the sample in use is replaced. The time of the old sample, sent
-        at s, has advanced to s + h, and the new sample was sent at s'. With r and e half-way
-        through the jump, and de the jump of e by this link, the work is exactly
+        The sample in use is replaced at the end of a period. By then, the time of the old
+        sample, sent at s, has advanced to s + h. The new sample was sent at s'. With r and e
+        half-way through the jump, and de the jump of e caused by this link, the work is exactly
 
             (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
 
-        For an age that varies smoothly this is the integral of the term with dT/dt that the
-        theorem leaves out.
+        For an age that varies smoothly, this is the integral of the term with dT/dt that the
+        theorem omits.
 
         Args:
             j: Index of the peer.
@@ -717,15 +714,14 @@ class SiteMotion:
         return _jump_alone(jump + alpha * energy_in_transit)
 
     def compute_dominance_work(self) -> "Increment":
-        """Computes the energy that a change of dominance factors adds to V_i of a site.
+        """Computes the energy that a change of the dominance factors adds to V_i of a site.
 
-        The dominance factor alpha_ij is the weight with which site i follows its peer j. Along
-        a ramp, the power of the change is
+        Along a ramp of the dominance factors alpha_ij, the power of the change is
 
             1/2 sum_j w_j int qd_j' Kd qd_j ds + qd_i' Kd sum_j w_j q_j(t - T_ij)
 
-        with w_j the time derivative of alpha_ij, T_ij the delay, Kd the damping gain, and q and
-        qd positions and velocities. The integral covers the last T_ij seconds. The second term
+        where w_j is the time derivative of alpha_ij, T_ij the delay, Kd the damping gain, q a
+        position and qd a velocity. The integral covers the last T_ij seconds. The second term
         arises because the velocity error of the site contains w_j. A sudden change adds the
         energy of the jump. The effect on the weights of the sites in the total energy is not
         included.
@@ -766,13 +762,13 @@ class SiteMotion:
         return _trapezoid(self, left, right, jump)
 
     def measure_torque_error(self) -> Array:
-        """Computes how much the recorded torques differ from those that the law demands.
+        """Computes how far the recorded torques deviate from those that the law demands.
 
         The law is evaluated again from the recorded motion. A large error means that the log
-        was changed, or that the arm ran a different law than the scenario states.
+        was modified, or that the arm ran a different law than the scenario states.
 
         Returns:
-            The largest difference of all joints, shape (K,), in N m. It is 0 for interpolated
+            The largest difference over all joints, shape (K,), in N m. It is 0 for interpolated
             records, and while the arm comes to rest.
         """
         records = self.records
@@ -786,16 +782,16 @@ class SiteMotion:
         return np.where(is_comparable, largest, 0.0)
 
     def compute_sampling_work(self) -> "Increment":
-        """Returns the work that arises because the continuous control law is executed in ticks.
+        """Returns the work caused by executing the continuous control law in ticks.
 
         With the filtered error r, the work has two parts:
 
         - Torque: the integral of r'(u - tau). The torque u is constant within a period, while
           the torque tau of the continuous law changes linearly until the end of the period.
-        - Parameter estimates: their recorded step, compared with the trapezoid rule for the
-          adaptive law.
+        - Parameter estimates: the difference between their recorded step and the trapezoidal
+          rule applied to the adaptive law.
 
-        This work is not part of the energy balance. It explains part of the balance's residual.
+        This work is not part of the energy balance, but explains part of its residual.
         """
         records = self.records
         c = self.constants
@@ -824,16 +820,15 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """Energy of one arm in the stability proof, split into its four parts, in J.
+    """The four parts of an arm's energy in the stability proof, in J.
 
-    Each part has the shape (K,) for K records. Their sum is V_i in the module's docstring.
+    Each part has shape (K,) for K records. Their sum is V_i in the docstring of the module.
 
     Attributes:
-        kinetic: Kinetic energy that corresponds to the filtered error r, 1/2 r'M r with the
-            inertia matrix M.
-        parameter: Energy of the errors of the parameter estimates.
+        kinetic: Kinetic energy of the filtered error r, 1/2 r'M r with the inertia matrix M.
+        parameter: Energy of the parameter estimation errors.
         position: Energy of the synchronisation error, which acts like a stretched spring.
-        delay: Energy of the motion of the peers that the site has not received yet.
+        delay: Energy of the peer motion that has not yet reached the site.
     """
 
     kinetic: Array
@@ -843,9 +838,9 @@ class FunctionalParts(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """Energy V_i of one arm in the stability proof: the sum of its parts, in J.
+        """Energy V_i of one arm in the stability proof, shape (K,), in J.
 
-        The shape is (K,), with one entry per record.
+        The sum of the four parts.
         """
         return self.kinetic + self.parameter + self.position + self.delay
 
@@ -874,11 +869,11 @@ def _energy_in_transit(constants: SiteConstants, peer_motion: DelayedPeer) -> Ar
 
 
 class Increment(NamedTuple):
-    """An amount of energy in each of K - 1 tick periods, in J, shape (K - 1,) each.
+    """The amount of energy in each of K - 1 tick periods, in J, shape (K - 1,) each.
 
-    The energy is the integral of a power by the trapezoid rule, plus a sudden change. At the
-    end of each period a new sample of a peer comes into use. The error of the site then jumps,
-    and some energies change with it.
+    The energy is the integral of a power, computed with the trapezoidal rule, plus a sudden
+    change: at the end of each period a new sample of a peer comes into use, so the error of the
+    site jumps, and some energies change with it.
 
     Attributes:
         left: Contribution of the power at the start of the period.
@@ -892,11 +887,9 @@ class Increment(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """Change of the energy in each tick period, in J, as the sum of the three parts.
+        """Change of the energy in each tick period, in J.
 
-        The parts are the contribution of the power at the start of the period, the contribution
-        at its end, and the jump at the end. The shape is (K - 1,), because K ticks bound K - 1
-        periods.
+        The sum of `left`, `right` and `jump`, shape (K - 1,).
         """
         return self.left + self.right + self.jump
 

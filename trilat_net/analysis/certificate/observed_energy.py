@@ -1,20 +1,19 @@
 """Checks the energies that a control law declares against the records of a run.
 
-Some control laws prove passivity by counting energy: they keep energy in stores (tanks), or
-track the energy that travels between the arms. Such a law declares these energies for every
-tick (period of its control loop). A wrong program could declare a wrong energy. Therefore this
-module computes the same energies independently, from the recorded torques and motion, and
-compares them:
+Some control laws ensure passivity through energy accounting: they keep energy in stores
+(tanks), or track the energy in transit between the arms. Such a law declares these energies at
+every tick. Since a faulty program could declare a wrong energy, this module computes the same
+energies independently, from the recorded torques and motion, and compares them:
 
 - Energy of the connection from arm j to arm i: the energy that the law of j sent, minus the
   energy that the law of i received.
-- Energy that the arm gives to its law: minus the sum of u_k'(q_{k+1} - q_k) over all ticks k.
-  Here u_k is the torque during tick k, and q_k are the joint angles.
+- Energy that the arm supplies to its law: minus the sum of u_k'(q_{k+1} - q_k) over all ticks
+  k, where u_k is the torque during tick k, and q_k are the joint angles.
 
 Invariant:
     - A declared energy counts as evidence only if it agrees with the computed energy.
-    - The verdict is negative if the energy of a connection or store is ever below zero. It is
-      also negative if the total energy that a law has dissipated ever decreases.
+    - The verdict is negative if the energy of a connection or store is ever below zero, or if
+      the total energy that a law has dissipated ever decreases.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +25,6 @@ import numpy as np
 from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction
 from ...hooks import find_hook
 from ...log import Log
-from ...own_code import ImportedLaw
 from ...results import JsonObject
 from ...scenario import Scenario
 from ..aligned import hold_torque
@@ -51,11 +49,11 @@ largest energy.
 
 
 class ObservedFinding(Enum):
-    """Result of checking the energies that control laws declare, such as a tank's.
+    """Result of checking the energies that control laws declare, such as the energy of a tank.
 
-    A law that never returns more energy than it received keeps its declared energy above zero.
-    The result is BROKEN if the declared energy does not follow from the recorded torques and
-    velocities, and NOT_JUDGED if the records do not suffice.
+    The declared energy stays above zero if the law never returns more energy than it received.
+    The result is BROKEN if the declared energy does not match the recorded torques and
+    velocities, and NOT_JUDGED if the records are not sufficient.
     """
 
     PASSIVE = auto()
@@ -65,9 +63,10 @@ class ObservedFinding(Enum):
 
     @property
     def meaning(self) -> str:
-        """Explanation for the user of what the finding means for a run. Empty if it needs none.
+        """Explanation of the finding for the user, or an empty string if it needs none.
 
-        The package `presentation` writes it, in the same words wherever it is explained.
+        The package `presentation` provides the wording, which is the same wherever the finding
+        is explained.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -103,9 +102,8 @@ class _EnergyCurve(NamedTuple):
     def name(self) -> str:
         """Short name of the energy for reports.
 
-        With sites m and s, the energy in transit from m to s is named "line m->s". The part of
-        this energy that is known to s is named "known at s of m". The energy stored at s is
-        named "store of s".
+        For sites m and s, the energy in transit from m to s is named "line m->s", the part of
+        it that is known to s "known at s of m", and the energy stored at s "store of s".
         """
         return _name_energy(self.kind, self.site, self.peer)
 
@@ -132,7 +130,7 @@ class _LeastEnergy(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Short name of the energy for reports, the same as that of its curve."""
+        """Short name of the energy for reports, identical to that of its curve."""
         return _name_energy(self.kind, self.site, self.peer)
 
     def to_json(self) -> JsonObject:
@@ -151,11 +149,11 @@ def _name_energy(kind: _EnergyKind, site: str, peer: str) -> str:
 
 
 class ObservedEnergy(NamedTuple):
-    """Judgement of a run by the energies that its control laws declare, such as an energy tank.
+    """Verdict on a run based on the energies that its laws declare, such as an energy tank.
 
-    `ObservedEnergy.of_log` computes the declared energies, and compares them with recorded
-    torques and motion. If a law never gives back more energy than it took, this is evidence
-    that the run is stable.
+    `ObservedEnergy.of_log` computes the declared energies and compares them with recorded
+    torques and motion. A law that never returns more energy than it received is evidence that
+    the run is stable.
 
     Attributes:
         finding: Whether the energies stay above zero, or why this is not judged.
@@ -164,11 +162,11 @@ class ObservedEnergy(NamedTuple):
         largest_j: Largest of all energies, in J.
         residual_j: Largest difference between the energy that a law dissipated and the sum of
             the other energies that it declares, in J.
-        sampling_j: Largest energy that an arm received and its law did not account for, in J.
+        sampling_j: Largest energy that an arm received without its law accounting for it, in J.
             Such energy arises because the torque is constant between ticks.
-        curves: Every energy over time, and the energies that the arms gave to their laws.
-        undeclared_sites: Sites whose laws declare no energies, although others do. The energies
-            are then not judged.
+        curves: Every energy over time, and the energies that the arms supplied to their laws.
+        undeclared_sites: Sites whose laws declare no energies, although other laws do. The
+            energies are then not judged.
         incomplete_sites: Sites with missing records, because of which the energies are not
             judged.
     """
@@ -185,13 +183,13 @@ class ObservedEnergy(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The verdict as a sentence for the user, which the package `presentation` writes."""
+        """The verdict as a sentence for the user, generated by the package `presentation`."""
         return str(find_hook("describe a finding")(self))
 
     def to_json(self) -> JsonObject:
-        """Returns the verdict, its premises and the least energies as values for JSON.
+        """Returns the verdict, its premises and the smallest energies as values for JSON.
 
-        The energies over time are left out, because they have a value per tick and are meant
+        The energies over time are omitted, because they have one value per tick and are meant
         for figures.
         """
         return {
@@ -208,23 +206,23 @@ class ObservedEnergy(NamedTuple):
     def of_log(cls, log: Log, *, own_laws: bool = False) -> "ObservedEnergy | None":
         """Checks the energies that control laws declare against recorded torques and motion.
 
-        A control law may state how much energy it stores. This check shows whether the
-        statement is true, and whether the law produced energy, which can make the arms
+        A control law may declare how much energy it stores. This check shows whether the
+        declaration is correct, and whether the law produced energy, which can make the arms
         unstable.
 
         Args:
             log: The log of the run.
-            own_laws: True to also evaluate laws that are not part of this program, which runs
-                their code.
+            own_laws: True to also evaluate laws that are not part of this program, which
+                executes their code.
 
         Returns:
-            The verdict. `None` if no law declares energies.
+            The verdict, or `None` if no law declares energies.
 
         Raises:
             LogError: A record cannot be read.
             ScenarioError: The file of a law that is not part of this program is missing.
         """
-        laws = find_energy_laws(log.scenario, own_laws=own_laws)
+        laws = cls.find_laws(log.scenario, own_laws=own_laws)
         if not laws:
             return None
 
@@ -244,6 +242,31 @@ class ObservedEnergy(NamedTuple):
 
         accounts = {site: _read_books(log, site, law) for site, law in laws.items()}
         return _judge_books(log, accounts)
+
+    @staticmethod
+    def find_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
+        """Returns the control laws that declare their stored and dissipated energy, by site.
+
+        An example is a law with an energy tank that declares the level of the tank.
+
+        Args:
+            scenario: Scenario of the run.
+            own_laws: True to also create laws that are not part of this program, which executes
+                their code.
+
+        Raises:
+            ScenarioError: The file of a law that is not part of this program is missing.
+        """
+        laws: dict[str, Any] = {}
+        user_laws = scenario.user_laws
+        for site in scenario.names:
+            setup = scenario.setup(site)
+            is_allowed = own_laws or site not in user_laws
+            if setup.law_factory is not None and is_allowed:
+                law = setup.law_factory(setup.law_context())
+                if callable(getattr(law, "energies", None)):
+                    laws[site] = law
+        return laws
 
 
 class _SiteBooks(NamedTuple):
@@ -266,31 +289,6 @@ class _SiteBooks(NamedTuple):
     taken: Array
     residual: Array
     leak: Array
-
-
-def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
-    """Returns the control laws that state their stored and dissipated energy, by site.
-
-    An example is a law with an energy tank that declares the level of the tank. A site is a
-    process that controls one arm.
-
-    Args:
-        scenario: Scenario of the run.
-        own_laws: True to also create laws that are not part of this program, which runs their
-            code.
-
-    Raises:
-        ScenarioError: The file of a law that is not part of this program is missing.
-    """
-    laws: dict[str, Any] = {}
-    for site, spec in scenario.sites.items():
-        setup = scenario.setup(site)
-        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
-        if setup.law_factory is not None and is_allowed:
-            law = setup.law_factory(setup.law_context())
-            if callable(getattr(law, "energies", None)):
-                laws[site] = law
-    return laws
 
 
 def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:

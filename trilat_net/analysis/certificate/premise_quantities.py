@@ -1,14 +1,14 @@
-"""Defines the data that show whether a condition of the stability theorem holds.
+"""Defines the data used to decide whether each condition of the stability theorem holds.
 
 A condition of the theorem is called a premise. For example, the premise "the delays are
-constant" is judged by `DelayQuantities`, which contains the delays of the network links.
-`premises` and `observed_energy` compute these classes from the log of a run. The package
-`presentation` writes the sentences about them, so that a sentence can be changed without
+constant" is judged from `DelayQuantities`, which contains the delays of the network links.
+`premises` and `observed_energy` create these objects from the log of a run. The package
+`presentation` generates the sentences about them, so the wording can be changed without
 touching the analysis.
 
 Invariant:
     - An empty collection means that nothing of this kind was found in the run.
-    - The quantities contain only names and numbers, no sentence.
+    - The quantities contain only names and numeric values, never sentences.
 """
 
 from collections.abc import Mapping
@@ -16,16 +16,18 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from ...hooks import find_hook
+from ...log import Log
 from ...results import JsonObject
 from ...scenario import Scenario
 from ..dominance_history import PeerLoss
+from ..timeline import Timeline
 from ..torque_sources import WallEnergy
 
 
 class FunctionalObstacle(Enum):
     """Reason why the energy function V of the stability proof does not exist for an arm.
 
-    Without V, the certificate judges the run by the other methods, for example by its final
+    Without V, the certificate judges the run with its other methods, for example from the final
     motion.
     """
 
@@ -38,14 +40,15 @@ class FunctionalObstacle(Enum):
 
 
 class MissingFunctional(NamedTuple):
-    """Arms for which no energy function V exists, all for one reason.
+    """Arms for which the energy function V does not exist, all for the same reason.
 
-    The stability proof needs V, an energy that never rises. Some control laws have none.
+    The stability proof requires V, which never rises. Some control laws do not have such a
+    function.
 
     Attributes:
         obstacle: The reason.
         law: Tag of the control law, if the law is the reason. Otherwise empty.
-        sites: Names of the sites, the processes that each control one arm.
+        sites: Names of the sites.
     """
 
     obstacle: FunctionalObstacle
@@ -56,15 +59,15 @@ class MissingFunctional(NamedTuple):
     def list_of_scenario(cls, scenario: Scenario) -> list["MissingFunctional"]:
         """Finds the arms of a scenario for which the energy function does not exist.
 
-        The energy exists only for certain control laws. It requires the true dynamic parameters
-        of the arm. It is not defined if the end effector also follows the orientation of other
-        arms.
+        The function exists only for certain control laws, and only if the true dynamic
+        parameters of the arm are known. It is not defined if the end effector also follows the
+        orientation of other arms.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
 
         Returns:
-            The sites of these arms, grouped by the reason. Empty if the energy exists for every
+            The sites of these arms, grouped by reason. Empty if the function exists for every
             arm.
         """
         sites_by_reason: dict[tuple[FunctionalObstacle, str], list[str]] = {}
@@ -89,10 +92,10 @@ class MissingFunctional(NamedTuple):
 class LawQuantities(NamedTuple):
     """Evidence on whether the energy function V exists for the control law of every arm.
 
-    V, the energy of the stability proof, exists for adaptive laws only.
+    V, the energy in the stability proof, exists only for adaptive laws.
 
     Attributes:
-        missing: Sites without V, grouped by the reason. The premise holds if there are none.
+        missing: Sites without V, grouped by reason. The premise holds if this is empty.
     """
 
     missing: tuple[MissingFunctional, ...]
@@ -101,8 +104,8 @@ class LawQuantities(NamedTuple):
 class ParameterFault(Enum):
     """Reason why an adaptive law cannot learn the true parameters theta of its arm.
 
-    The proof assumes that constant parameters exist with which the law is exact. Each fault
-    makes this assumption false, and the premise names the sites concerned.
+    The proof assumes that there are constant parameters for which the law's model is exact.
+    Each fault violates this assumption. The premise names the affected sites.
     """
 
     OUTSIDE_BOX = auto()
@@ -116,24 +119,25 @@ class ParameterFault(Enum):
 class ParameterQuantities(NamedTuple):
     """Evidence on whether adaptive control laws can learn the parameters of their arms.
 
-    The stability theorem requires that the model of the law contains every load of the arm.
+    The stability theorem requires the model in the law to include every load on the arm.
 
     Attributes:
-        faults: Name of the site and reason for each fault. Empty if the condition holds.
+        faults: Pairs of site name and reason, one per fault. Empty if the condition holds.
     """
 
     faults: tuple[tuple[str, ParameterFault], ...]
 
 
 class GainQuantities(NamedTuple):
-    """Evidence for the condition that the damping gain Kd of all sites is equal up to a factor.
+    """Evidence on whether the damping gains Kd of all sites are equal up to a factor.
 
     For example, Kd may be twice as large at one site, because the weights of the sites in V
-    compensate for the factor. The weights cannot compensate for other differences.
+    compensate for the factor. Other differences cannot be compensated for in this way.
 
     Attributes:
-        Kd: Gain of each site per joint, in N m s/rad. In task space per coordinate, in N s/m.
-        scales: Factor of each site. `None` if the gains are not multiples of each other.
+        Kd: Gain of each site per joint, in N m s/rad, or in task space per coordinate, in N
+            s/m.
+        scales: Factor of each site, or `None` if the gains are not multiples of each other.
         is_positive: True if no gain is zero.
     """
 
@@ -145,8 +149,8 @@ class GainQuantities(NamedTuple):
 class WallQuantities(NamedTuple):
     """Evidence on whether simulated walls generate no energy, as the theorem requires.
 
-    A wall whose force is computed once per tick (control period) generates energy. The damping
-    of the arm may remove this energy.
+    A wall whose force is computed once per tick generates energy, which the damping of the arm
+    may remove.
 
     Attributes:
         walls: The walls that were touched, with their energies and dampings.
@@ -158,7 +162,7 @@ class WallQuantities(NamedTuple):
     def active(self) -> tuple[WallEnergy, ...]:
         """Walls that generate at least as much energy as the touching arm's damping removes.
 
-        A simulated wall computes its force once per tick and thereby generates energy. If the
+        A simulated wall computes its force once per tick, which generates energy. If the
         damping of the arm does not remove this energy, the contact may vibrate. Empty if there
         is no such wall.
         """
@@ -170,16 +174,15 @@ class WallQuantities(NamedTuple):
 class DominanceQuantities(NamedTuple):
     """Evidence on whether the dominance factors are constant and determine weights for V.
 
-    A dominance factor is the weight with which an arm follows another arm. The stability
-    theorem requires both. V is its energy function.
+    The stability theorem requires both. V is its energy function.
 
     Attributes:
         changing: Sites whose dominance factors change.
-        losses: Spans of time in which sites continued without a peer.
+        losses: Time spans in which sites continued without a peer.
         groups: Closed groups of sites, which follow no site outside their group. Empty if the
             factors change.
-        weightless: Sites with the weight zero in V.
-        beta: Weight of each site in V. `None` if there are no unique weights.
+        weightless: Sites with zero weight in V.
+        beta: Weight of each site in V, or `None` if the weights are not unique.
     """
 
     changing: tuple[str, ...] = ()
@@ -190,9 +193,9 @@ class DominanceQuantities(NamedTuple):
 
 
 class AgeRange(NamedTuple):
-    """Smallest and largest age of the states of another arm that a control loop used.
+    """Smallest and largest age of the samples from a peer that a control loop used.
 
-    The age is the time since the state was sent: the delay that the control law experiences.
+    The age is the time since the sample was sent: the delay that the control law experiences.
 
     Attributes:
         peer: Site that sends the samples.
@@ -213,8 +216,8 @@ class DelayQuantities(NamedTuple):
     The stability theorem requires this, because a varying delay can add energy to the arms.
 
     Attributes:
-        varying: Ages on the links whose delay varies. Empty if the condition holds.
-        constant_s: Delay of each of the other links that delivered a sample, in s.
+        varying: Age ranges on the links whose delay varies. Empty if the condition holds.
+        constant_s: Delay of every other link that delivered a sample, in s.
     """
 
     varying: tuple[AgeRange, ...]
@@ -222,13 +225,13 @@ class DelayQuantities(NamedTuple):
 
 
 class Interruption(NamedTuple):
-    """Interval of time in which an arm did not follow the other arms.
+    """Time interval in which an arm did not follow the other arms.
 
-    The stability theorem requires that all arms follow during the whole run. An arm stops
-    following, for example, when no messages arrive and it holds its position.
+    The stability theorem requires that all arms follow throughout the run. An arm stops
+    following, for example, when no samples arrive and it holds its position.
 
     Attributes:
-        site: Name of the site, the process that controls the arm.
+        site: Name of the site.
         from_s: Start, in s.
         to_s: End, in s.
     """
@@ -239,14 +242,14 @@ class Interruption(NamedTuple):
 
 
 class FollowingQuantities(NamedTuple):
-    """Evidence on whether every arm followed the other arms during the whole run.
+    """Evidence on whether every arm followed the other arms throughout the run.
 
     The stability theorem requires this. It does not cover an arm that was held or stopped.
 
     Attributes:
-        interruptions: Times at which sites held, braked, returned or had stopped.
-        limited_ticks: Number of ticks at which the velocity of the reference was limited, by
-            the name of the site.
+        interruptions: Intervals in which sites held, braked, returned or had stopped.
+        limited_ticks: Number of ticks at which the reference velocity was limited, keyed by
+            site name.
         is_halted: True if a site had stopped.
     """
 
@@ -258,12 +261,12 @@ class FollowingQuantities(NamedTuple):
 class CutTorque(NamedTuple):
     """Finding that motors could not deliver the torque that the control law demanded.
 
-    The stability theorem then does not apply, because it assumes motors without a limit.
+    The stability theorem then does not apply, because it assumes motors without a torque limit.
 
     Attributes:
-        site: Name of the site, the process that controls the arm.
-        joints: Names of the joints concerned. Empty if the joints have no names.
-        ticks: Number of ticks in which a torque was cut off at its limit.
+        site: Name of the site.
+        joints: Names of the affected joints. Empty if the joints have no names.
+        ticks: Number of ticks in which a torque was clipped at its limit.
     """
 
     site: str
@@ -274,10 +277,10 @@ class CutTorque(NamedTuple):
 class TorqueQuantities(NamedTuple):
     """Evidence on whether every motor delivered the torque that its control law demanded.
 
-    A motor cuts off a torque above its limit. The stability theorem assumes that it does not.
+    A motor clips torques above its limit, which the stability theorem does not allow for.
 
     Attributes:
-        cut: Sites whose torque was cut off. The premise holds if there are none.
+        cut: Sites whose torque was clipped. The premise holds if this is empty.
     """
 
     cut: tuple[CutTorque, ...]
@@ -289,8 +292,8 @@ class TouchedStop(NamedTuple):
     The stability theorem then does not apply, because its model of the arm has no end stops.
 
     Attributes:
-        site: Name of the site, the process that controls the arm.
-        joints: Names of the joints that touched. Empty if the joints have no names.
+        site: Name of the site.
+        joints: Names of the joints that reached a stop. Empty if the joints have no names.
         from_s: Time of the first contact, in s.
     """
 
@@ -300,23 +303,23 @@ class TouchedStop(NamedTuple):
 
 
 class StopQuantities(NamedTuple):
-    """Evidence on whether any joint touched its mechanical end stops.
+    """Evidence on whether any joint reached its mechanical end stops.
 
     The stability theorem requires that none did, because its model has no end stops.
 
     Attributes:
-        touched: Sites whose arms touched their stops. Empty if the condition holds.
+        touched: Sites whose arms reached their stops. Empty if the condition holds.
     """
 
     touched: tuple[TouchedStop, ...]
 
 
 class AxisQuantities(NamedTuple):
-    """Evidence for the condition that sites which follow each other follow along the same axes.
+    """Evidence on whether sites follow each other along the same axes.
 
-    In task space, an end effector may follow along some axes only, for example not in
-    orientation. The condition fails if a site follows an axis that the followed site leaves
-    free.
+    In task space, an end effector may follow along only some axes, for example not in
+    orientation. The condition fails if a site follows along an axis that the site it follows
+    leaves free.
 
     Attributes:
         faults: Pairs (follower, followed site) with an axis that only the follower follows.
@@ -326,15 +329,16 @@ class AxisQuantities(NamedTuple):
 
 
 class SingularPoseQuantities(NamedTuple):
-    """Evidence on whether any arm came near a singular pose, such as a stretched arm.
+    """Evidence on whether any arm came near a singular pose, such as a fully stretched arm.
 
-    In such a pose the end effector cannot move in every direction, however fast the joints
+    In a singular pose, the end effector cannot move in every direction, however fast the joints
     turn. The stability theorem does not cover such poses.
 
     Attributes:
-        near_s: Time from which the arm of a site was near a singular pose, in s, by site.
-        least_values: Least singular value of the Jacobian of each site, in m/rad. Near a
-            singular pose it is close to 0.
+        near_s: When the arm of each affected site first came near a singular pose, in s, keyed
+            by site.
+        least_values: Smallest singular value of each site's Jacobian, in m/rad. It is close to
+            0 near a singular pose.
     """
 
     near_s: Mapping[str, float]
@@ -344,12 +348,12 @@ class SingularPoseQuantities(NamedTuple):
 class Supply(NamedTuple):
     """Energy that users and walls supplied to the arms, and the time without pushes at the end.
 
-    The stability theorem assumes that they do not supply energy without limit.
+    The stability theorem assumes that they do not supply unlimited energy.
 
     Attributes:
         sources: Names of the sources.
-        energy_j: Largest energy that they supplied beyond what they had absorbed, in J.
-        is_passive: True if this energy is a rounding error.
+        energy_j: Largest energy supplied in excess of the energy absorbed, in J.
+        is_passive: True if this energy is only a rounding error.
         in_task_space: True if a site follows in task space. In that case r is qd - v.
         released_s: Time after which no operator or wall pushes, in s.
         free_s: Duration of the motion after this time, in s.
@@ -366,15 +370,15 @@ class Supply(NamedTuple):
 
 
 class OperatorQuantities(NamedTuple):
-    """Evidence for the premise that operators and environments are passive.
+    """Evidence on whether operators and environments are passive.
 
     A passive operator never returns more energy than it received. Otherwise V may rise.
 
     Attributes:
         unmeasured: Sites with external arms whose external torque is not recorded.
         weightless: Sites that are pushed although their weight in V is zero.
-        supply: Energy that operators and environments supplied. `None` without pushes, or if
-            V does not show the energy.
+        supply: Energy supplied by operators and environments, or `None` if there were no pushes
+            or V does not show this energy.
     """
 
     unmeasured: tuple[str, ...] = ()
@@ -383,24 +387,31 @@ class OperatorQuantities(NamedTuple):
 
 
 class RecordQuantities(NamedTuple):
-    """Evidence on whether the log has a record of every control period of every arm.
+    """Evidence on whether the log has a record for every tick of every arm.
 
     The energy function V of the stability proof cannot be computed where records are missing.
 
     Attributes:
-        unjudged_s: Spans (start, end) in which records are missing although all sites were
+        unjudged_s: Time spans (start, end) in which records are missing although all sites were
             present, in s.
-        is_whole: True if no records are missing at all, not even during absences of sites.
+        is_whole: True if no records are missing at all, not even while sites were absent.
     """
 
     unjudged_s: tuple[tuple[float, float], ...]
     is_whole: bool
 
 
-class AbsentSpan(NamedTuple):
-    """Interval of time in which a site was absent from the session and executed no ticks.
+LEAST_ABSENCE_S = 0.1
+"""Shortest absence of a site that counts, in s.
 
-    For example, its process was stopped and started again.
+The records of sites that are present also end at times that differ by up to this much.
+"""
+
+
+class AbsentSpan(NamedTuple):
+    """Time interval in which a site was absent from the session and executed no ticks.
+
+    This happens, for example, when its process is stopped and restarted.
 
     Attributes:
         site: Name of the site.
@@ -412,15 +423,44 @@ class AbsentSpan(NamedTuple):
     from_s: float
     to_s: float
 
+    @classmethod
+    def list_of_log(cls, log: Log) -> "list[AbsentSpan]":
+        """Finds the time intervals in which sites were absent from the session.
+
+        A site is absent after it has left and until it joins again. If the session reported
+        that the site left or was lost, it is also absent from its last record to the end of the
+        run.
+
+        Args:
+            log: The log of the run.
+
+        Returns:
+            The intervals, sorted by start. Empty if no site was absent.
+        """
+        run_end_s = Timeline(log).end_s
+        absent = []
+        for site in log.sites:
+            site_log = log[site]
+            for first_tick, last_tick in log.absences.get(site, ()):
+                absence_start_s = first_tick / site_log.rate_hz
+                absence_end_s = (last_tick + 1) / site_log.rate_hz
+                absent.append(cls(site, absence_start_s, absence_end_s))
+            last_s = (site_log.last_tick + 1) / site_log.rate_hz
+            kinds = {event.kind for event in log.events if event.about == site}
+            has_left = bool(kinds & {"left", "lost"})
+            if last_s < run_end_s - LEAST_ABSENCE_S and has_left:
+                absent.append(cls(site, last_s, run_end_s))
+        return sorted(absent, key=lambda span: span[1:])
+
 
 class PresentStretch(NamedTuple):
-    """Interval of time between two absences, in which the processes of all arms were present.
+    """Time interval between two absences, in which the processes of all arms were present.
 
     Attributes:
         from_s: Start, in s.
         to_s: End, in s.
-        follow_from_s: Time from which all sites follow their peers, in s. `None` if they never
-            do.
+        follow_from_s: Time from which all sites follow their peers, in s, or `None` if they
+            never do.
         varying: Links (peer, site) whose delay varies after this time.
     """
 
@@ -431,14 +471,14 @@ class PresentStretch(NamedTuple):
 
 
 class PresenceQuantities(NamedTuple):
-    """Evidence on whether the processes of all arms are present during the whole run.
+    """Evidence on whether the processes of all arms were present throughout the run.
 
     A process may leave a session and return. The stability theorem then applies to each
     interval between two absences.
 
     Attributes:
-        absent: Spans of time during which sites were absent.
-        stretches: The intervals between absences, during which all sites were present.
+        absent: Time intervals in which sites were absent.
+        stretches: The intervals between absences, in which all sites were present.
     """
 
     absent: tuple[AbsentSpan, ...]
@@ -448,13 +488,13 @@ class PresenceQuantities(NamedTuple):
 class BooksQuantities(NamedTuple):
     """Evidence on whether the energies that control laws declare are correct.
 
-    A control law may state how much energy it stores. The statement is compared with the energy
-    that follows from recorded torques and velocities.
+    A control law may declare how much energy it stores. The declared energy is compared with
+    the energy computed from recorded torques and velocities.
 
     Attributes:
         site: Site whose law has the largest error.
         residual_j: This error, in J.
-        scale_j: Largest energy that occurs, in J, with which the error is compared.
+        scale_j: Largest energy that occurs, in J, to which the error is compared.
     """
 
     site: str
@@ -463,14 +503,15 @@ class BooksQuantities(NamedTuple):
 
 
 class BookedTorqueQuantities(NamedTuple):
-    """Evidence for the condition that control laws use the torque that the arms received.
+    """Evidence on whether control laws use the torque that the arms actually received.
 
-    If a torque was cut off at the limit of a motor, a law that uses the demanded torque
+    If a torque was clipped at a motor limit, a law that uses the demanded torque instead
     declares wrong energies.
 
     Attributes:
-        cut: Sites whose torque was cut off at the limit of their actuators.
-        unbooked: Sites among `cut` whose law uses a different torque than the arm received.
+        cut: Sites whose torque was clipped at the limit of their actuators.
+        unbooked: Sites in `cut` whose law uses a different torque from the one that the arm
+            received.
     """
 
     cut: tuple[str, ...]
@@ -478,11 +519,11 @@ class BookedTorqueQuantities(NamedTuple):
 
 
 class SamplingQuantities(NamedTuple):
-    """Evidence for the condition that laws account for nearly all energy that arms receive.
+    """Evidence on whether laws account for nearly all energy that the arms receive.
 
-    Between two control periods the torque is constant while the arm moves on. The law, which
-    sees the arm only once per period, does not account for the energy that the torque supplies
-    meanwhile.
+    Between two ticks, the torque is constant while the arm continues to move. The law sees the
+    arm only once per tick, and does not account for the energy that the torque supplies in
+    between.
 
     Attributes:
         site: Site that received most of this energy.
@@ -534,17 +575,17 @@ class Premise(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence that says what the log shows about the condition, for the user.
+        """A sentence for the user on what the log shows about the condition.
 
-        For constant delays, it names for example the links whose delays varied. The package
-        `presentation` composes it from the numbers in `quantities`.
+        For constant delays, for example, the sentence names the links whose delays varied. The
+        package `presentation` generates it from the values in `quantities`.
         """
         return str(find_hook("describe a premise")(self.quantities))
 
     def to_json(self) -> JsonObject:
-        """Returns the premise as a row of `trilat certify --json`.
+        """Returns the premise as one entry of the output of `trilat certify --json`.
 
-        For example {"name": "torque", "holds": True, "text": ...}, where the text states the
+        For example {"name": "torque", "holds": True, "text": ...}, where the text describes the
         evidence.
         """
         return {"name": self.name, "holds": self.holds, "text": self.text}

@@ -1,24 +1,25 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
-The theorem says that an energy function V of all arms never rises, unless an operator supplies
-energy. Its proof is in docs/theory/theorem.md. The theorem has conditions, called premises:
+The theorem states that an energy function V of all arms never rises unless an operator supplies
+energy. Its proof is in docs/theory/theorem.md. The conditions of the theorem are called
+premises:
 
 - The network delays are constant.
-- The dominance factors, the weights with which the arms follow each other, are constant. Every
-  arm follows every other arm, directly or through further arms.
-- The damping gain Kd is the same at every arm, up to a factor per arm.
+- The dominance factors are constant, and every arm follows every other arm, directly or through
+  further arms.
+- The damping gain Kd is the same at every arm, up to one factor per arm.
 - Every arm uses the adaptive law, which estimates the parameters theta of the arm.
-- No operator moves an arm, or the operators are passive with respect to the filtered error r.
-  This is the joint velocity plus a gain Lambda times the position error.
+- No operator moves an arm, or the operators are passive with respect to the filtered error r,
+  which is the joint velocity plus a gain Lambda times the position error.
 
-The module also finds the times for which records are missing.
+The module also finds time spans in which records are missing.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always contains the quantities that show
-      it. The package `presentation` writes the sentences.
-    - Missing information never makes a run stable. The judgement stays open if too many records
+      which. The package `presentation` generates the sentences.
+    - Missing information never makes a run stable. The verdict stays open if too many records
       are missing, or if the run was repeated with the recorded motion of some arms.
-    - A log that was changed after it was written does not pass.
+    - A log that was modified after it was written does not pass.
 """
 
 from collections.abc import Mapping
@@ -48,6 +49,7 @@ from .energy_balance import (
 )
 from .energy_terms import SiteConstants
 from .premise_quantities import (
+    LEAST_ABSENCE_S,
     AbsentSpan,
     AgeRange,
     AxisQuantities,
@@ -89,11 +91,6 @@ MIN_FREE_S = 1.0
 """Shortest motion without operators at the end of a run to which the theorem applies, in s."""
 MIN_FREE_AGES = 5.0
 """Shortest such motion as a multiple of the largest age of a sample in use."""
-LEAST_ABSENCE_S = 0.1
-"""Shortest absence of a site that counts, in s.
-
-The records of sites that are present also end at times that differ by up to this much.
-"""
 LEAST_SPEED_M_S = 1e-9
 """Smallest speed of an end effector that counts as motion along an axis, in m/s.
 
@@ -102,22 +99,22 @@ Slower speeds are the rounding error of an axis along which the end effector can
 
 
 class FunctionalFacts(NamedTuple):
-    """Quantities of a run that the checks of the stability theorem's conditions read.
+    """Quantities of a run that depend on V and are used to check the theorem's conditions.
 
-    They include V, the energy function of the stability proof, and the gaps in the log.
-    `gather_facts` computes this object once for all checks.
+    V is the energy function of the stability proof. The quantities also include the gaps in the
+    log. `RunFacts.of_log` computes this object once for all checks.
 
     Attributes:
         log: The log of the run.
-        energies: Energies of every site, by name.
+        energies: Energies of every site, keyed by site name.
         balance: Energy balance of all sites together.
         groups: Closed groups of sites, which follow no site outside their group, at the first
             time at which there are several groups. The weights beta of the sites in V are then
             not unique. Empty if the weights are always unique.
-        absent: Spans during which a site was absent.
-        unjudged: Spans, as (start, end) in s, in which records are missing although all sites
+        absent: Time intervals in which a site was absent.
+        unjudged: Time spans (start, end) in s in which records are missing although all sites
             were present.
-        tolerance: Size that a rise of V must exceed to count, in J.
+        tolerance: Threshold that a rise of V must exceed to count, in J.
     """
 
     log: Log
@@ -129,18 +126,18 @@ class FunctionalFacts(NamedTuple):
     tolerance: float
 
 
-class _RunFacts(NamedTuple):
-    """Quantities of a run that are needed to check the conditions of the stability theorem.
+class RunFacts(NamedTuple):
+    """Quantities of a run needed to check the conditions of the stability theorem.
 
-    The theorem says that an energy function V of all arms does not rise by itself.
+    The theorem states that an energy function V of all arms does not rise by itself.
 
     Attributes:
         log: The log of the run.
-        constants: Gains and limits of every site, the process that runs one arm, by name. Empty
-            if V does not exist for some site.
-        functional: V over time, and the energies that changed it. `None` if V cannot be
+        constants: Gains and limits of every site, keyed by site name. Empty if V does not exist
+            for some site.
+        functional: V over time and the energies that changed it, or `None` if V cannot be
             computed.
-        unknown: The reason why V cannot be computed. `None` if V can be computed.
+        unknown: The reason why V cannot be computed, or `None` if it can.
     """
 
     log: Log
@@ -148,87 +145,115 @@ class _RunFacts(NamedTuple):
     functional: FunctionalFacts | None = None
     unknown: NoFunctional | RecordGap | None = None
 
+    @classmethod
+    def of_log(cls, log: Log) -> "RunFacts":
+        """Computes the quantities needed to check the conditions of the theorem from a log.
 
-def gather_facts(log: Log) -> _RunFacts:
-    """Computes from a log the quantities for checking the conditions of the stability theorem.
+        The stability theorem uses an energy function of all arms. If this function does not
+        exist for one of the control laws, or if the records of the arms overlap at too few
+        times to compute it, the result contains the reason.
 
-    The theorem uses an energy function of all arms. This function does not exist for every
-    control law. The function cannot be computed if the records of the arms have too few times
-    in common. The result then contains the reason.
+        Args:
+            log: The log of the run.
 
-    Args:
-        log: The log of the run.
+        Raises:
+            LogError: The log records an invalid change of the settings, such as of a dominance
+                factor.
+        """
+        missing = MissingFunctional.list_of_scenario(log.scenario)
+        if missing:
+            return cls(log, {}, unknown=NoFunctional(tuple(missing)))
 
-    Raises:
-        LogError: A recorded change of the settings, such as of a dominance factor, is not
-            valid.
-    """
-    missing = MissingFunctional.list_of_scenario(log.scenario)
-    if missing:
-        return _RunFacts(log, {}, unknown=NoFunctional(tuple(missing)))
+        constants = {site: SiteConstants.derive(log.scenario, site) for site in log.sites}
+        energies = SiteEnergy.by_site(log)
+        if not energies:
+            return cls(log, constants, unknown=RecordGap.NO_COMMON_TIME)
+        balance = EnergyBalance.of_energies(energies)
+        absent = AbsentSpan.list_of_log(log)
+        if not balance.judged.any():
+            return cls(log, constants, unknown=RecordGap.NO_PERIOD)
 
-    constants = {site: SiteConstants.derive(log.scenario, site) for site in log.sites}
-    energies = SiteEnergy.by_site(log)
-    if not energies:
-        return _RunFacts(log, constants, unknown=RecordGap.NO_COMMON_TIME)
-    balance = EnergyBalance.of_energies(energies)
-    absent = find_absent_spans(log)
-    if not balance.judged.any():
-        return _RunFacts(log, constants, unknown=RecordGap.NO_PERIOD)
+        # the first dominance matrix with several closed groups, for which beta is not unique
+        matrices = map(DominanceMatrix, find_dominance_matrices(energies))
+        closed_groups = (matrix.find_closed_groups() for matrix in matrices)
+        ambiguous_groups = next((groups for groups in closed_groups if len(groups) > 1), ())
+        group_names = tuple(
+            tuple(log.sites[index] for index in group) for group in ambiguous_groups
+        )
+        unjudged_while_present = []
+        for from_s, to_s in balance.unjudged_spans:
+            if not any(span.from_s < to_s and from_s < span.to_s for span in absent):
+                unjudged_while_present.append((from_s, to_s))
 
-    # the first dominance matrix with several closed groups, for which beta is not unique
-    matrices = map(DominanceMatrix, find_dominance_matrices(energies))
-    closed_groups = (matrix.find_closed_groups() for matrix in matrices)
-    ambiguous_groups = next((groups for groups in closed_groups if len(groups) > 1), ())
-    group_names = tuple(
-        tuple(log.sites[index] for index in group) for group in ambiguous_groups
-    )
-    unjudged_while_present = []
-    for from_s, to_s in balance.unjudged_spans:
-        if not any(span.from_s < to_s and from_s < span.to_s for span in absent):
-            unjudged_while_present.append((from_s, to_s))
+        sampling_j = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
+        facts = FunctionalFacts(
+            log=log,
+            energies=energies,
+            balance=balance,
+            groups=group_names,
+            absent=absent,
+            unjudged=unjudged_while_present,
+            tolerance=float(np.ptp(balance.unexplained)) + sampling_j + ZERO_ENERGY_J,
+        )
+        return cls(log, constants, facts)
 
-    sampling_j = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
-    facts = FunctionalFacts(
-        log=log,
-        energies=energies,
-        balance=balance,
-        groups=group_names,
-        absent=absent,
-        unjudged=unjudged_while_present,
-        tolerance=float(np.ptp(balance.unexplained)) + sampling_j + ZERO_ENERGY_J,
-    )
-    return _RunFacts(log, constants, facts)
+    def check_premises(self) -> list[Premise]:
+        """Checks whether a run meets the conditions (premises) of the stability theorem.
+
+        Also checks that virtual walls, whose force is computed once per tick, generate no
+        energy. If the energy function of the theorem cannot be computed, only the control laws
+        and the walls are checked.
+
+        Returns:
+            The premises that apply to this run, in the order used in the stability certificate.
+        """
+        missing = MissingFunctional.list_of_scenario(self.log.scenario)
+        law = Premise("law", bool(self.constants), LawQuantities(tuple(missing)))
+        premises: list[Premise | None] = [law]
+
+        if self.constants:
+            premises += [_check_parameters(self), _check_gains(self)]
+        premises.append(_check_walls(self.log))
+        if self.functional is not None:
+            premises += [check(self.functional) for check in FUNCTIONAL_CHECKS]
+
+        # A check returns None if its premise does not concern the run.
+        return [premise for premise in premises if premise is not None]
+
+    def collect_evidence(self, min_coverage: float) -> Evidence:
+        """Collects evidence on how complete the records are and whether the log was modified.
+
+        A run with too few records is not judged stable (see `Evidence.reasons`).
+
+        Args:
+            min_coverage: Smallest acceptable fraction of ticks that were recorded, and of tick
+                periods in which the energy of the stability proof is known. Between 0 and 1.
+        """
+        log = self.log
+        facts = self.functional
+        functional_share = None
+        if facts is not None and not facts.groups:
+            t_s = facts.balance.t_s
+            judged = facts.balance.judged
+            # Spans that are unjudged because a site was absent do not count against the share.
+            unjudged_in_absence = set(facts.balance.unjudged_spans) - set(facts.unjudged)
+            all_present = np.ones(len(judged), dtype=np.bool_)
+            for from_s, to_s in unjudged_in_absence:
+                all_present &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)
+            functional_share = float(judged[all_present].mean()) if all_present.any() else 0.0
+
+        recorded_ticks = {site: len(np.unique(log[site].tick)) for site in log.sites}
+        expected_ticks = {site: log.expected_ticks(site) for site in log.sites}
+        return Evidence(
+            coverage=Coverage(recorded_ticks, expected_ticks),
+            functional_share=functional_share,
+            min_coverage=min_coverage,
+            integrity=log.judge_integrity(),
+            unmet=tuple(site for site in log.sites if site not in log.executed_sites),
+        )
 
 
-def check_premises(run: _RunFacts) -> list[Premise]:
-    """Checks whether a run meets the conditions (premises) of the stability theorem.
-
-    It also checks that virtual walls, whose force is computed once per tick, generate no
-    energy. If the energy function of the theorem cannot be computed, only the control laws and
-    the walls are checked.
-
-    Args:
-        run: Facts of the run, from `gather_facts`.
-
-    Returns:
-        The premises that concern this run, in the order in which a certificate lists them.
-    """
-    missing = MissingFunctional.list_of_scenario(run.log.scenario)
-    law = Premise("law", bool(run.constants), LawQuantities(tuple(missing)))
-    premises: list[Premise | None] = [law]
-
-    if run.constants:
-        premises += [_check_parameters(run), _check_gains(run)]
-    premises.append(_check_walls(run.log))
-    if run.functional is not None:
-        premises += [check(run.functional) for check in FUNCTIONAL_CHECKS]
-
-    # A check returns None if its premise does not concern the run.
-    return [premise for premise in premises if premise is not None]
-
-
-def _check_parameters(run: _RunFacts) -> Premise:
+def _check_parameters(run: RunFacts) -> Premise:
     """Checks that the adaptive laws can learn the parameters theta of their arms.
 
     A law keeps its estimates within limits, so theta must lie between them. Parameters that a
@@ -252,7 +277,7 @@ def _check_parameters(run: _RunFacts) -> Premise:
     return Premise("parameters", not faults, ParameterQuantities(tuple(faults)))
 
 
-def _check_gains(run: _RunFacts) -> Premise:
+def _check_gains(run: RunFacts) -> Premise:
     """Checks that the gains Kd of all sites are positive and equal up to a scalar per site.
 
     Only then do weights beta exist with which the exchanged energies of all sites cancel in V.
@@ -545,34 +570,6 @@ def _check_records(run: FunctionalFacts) -> Premise:
     return Premise("records", None if run.unjudged else True, quantities)
 
 
-def find_absent_spans(log: Log) -> list[AbsentSpan]:
-    """Finds the spans of time during which sites were absent from the session.
-
-    A site is absent while it has left and not yet joined again, and also from its last record
-    to the end of the run if the session reported that it left or was lost.
-
-    Args:
-        log: The log of the run.
-
-    Returns:
-        The spans, sorted by their start. Empty if no site was absent.
-    """
-    run_end_s = Timeline(log).end_s
-    absent = []
-    for site in log.sites:
-        site_log = log[site]
-        for first_tick, last_tick in log.absences.get(site, ()):
-            absence_start_s = first_tick / site_log.rate_hz
-            absence_end_s = (last_tick + 1) / site_log.rate_hz
-            absent.append(AbsentSpan(site, absence_start_s, absence_end_s))
-        last_s = (site_log.last_tick + 1) / site_log.rate_hz
-        kinds = {event.kind for event in log.events if event.about == site}
-        has_left = bool(kinds & {"left", "lost"})
-        if last_s < run_end_s - LEAST_ABSENCE_S and has_left:
-            absent.append(AbsentSpan(site, last_s, run_end_s))
-    return sorted(absent, key=lambda span: span[1:])
-
-
 def _check_presence(run: FunctionalFacts) -> Premise | None:
     """Checks that all sites are present during the whole run.
 
@@ -670,38 +667,3 @@ def _examine_stretch(
             if len(age_s) and np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S:
                 varying.append((peer, site))
     return PresentStretch(from_s, to_s, all_follow_s, tuple(varying))
-
-
-def collect_evidence(run: _RunFacts, min_coverage: float) -> Evidence:
-    """Collects evidence on how complete a run's records are and whether its log was changed.
-
-    A run with too few records is not called stable, see `Evidence.reasons`.
-
-    Args:
-        run: Facts of the run, computed by `gather_facts`.
-        min_coverage: Least fraction of ticks that must be recorded, and least fraction of tick
-            periods in which the energy of the stability proof must be known, for a certificate.
-            Between 0 and 1.
-    """
-    log = run.log
-    facts = run.functional
-    functional_share = None
-    if facts is not None and not facts.groups:
-        t_s = facts.balance.t_s
-        judged = facts.balance.judged
-        # Spans that are unjudged because a site was absent do not count against the share.
-        unjudged_in_absence = set(facts.balance.unjudged_spans) - set(facts.unjudged)
-        all_present = np.ones(len(judged), dtype=np.bool_)
-        for from_s, to_s in unjudged_in_absence:
-            all_present &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)
-        functional_share = float(judged[all_present].mean()) if all_present.any() else 0.0
-
-    recorded_ticks = {site: len(np.unique(log[site].tick)) for site in log.sites}
-    expected_ticks = {site: log.expected_ticks(site) for site in log.sites}
-    return Evidence(
-        coverage=Coverage(recorded_ticks, expected_ticks),
-        functional_share=functional_share,
-        min_coverage=min_coverage,
-        integrity=log.judge_integrity(),
-        unmet=tuple(site for site in log.sites if site not in log.executed_sites),
-    )

@@ -1,15 +1,15 @@
 """Computes the energy function V of all arms while a session runs.
 
-A person who watches a running session can thus see whether the energy of the arms falls, as the
-stability proof demands (`energy_terms` defines V). After the session, `trilat certify` computes
-V from the whole log. `RunningEnergy` uses the same functions, but receives one record of an arm
-at a time. It keeps only the newest records of each arm, in a `RecordWindow`.
+This lets a person who watches a running session see whether the energy of the arms falls, as
+the stability proof demands (`energy_terms` defines V). After the session, `trilat certify`
+computes V from the entire log. `RunningEnergy` uses the same functions, but receives the
+records one at a time and keeps only the newest ones of each arm, in a `RecordWindow`.
 
 Invariant:
-    - V equals the result of `trilat certify` at the same times, up to rounding. Therefore the
-      windows are long enough to contain all delayed states that the arms use.
-    - Nothing is extrapolated. V at a time is computed when all records up to it have arrived,
-      and is left out if records are lost.
+    - V equals the result of `trilat certify` at the same times, up to rounding. The windows are
+      therefore long enough to contain all delayed states that the arms use.
+    - Nothing is extrapolated. V at a given time is computed once all records up to that time
+      have arrived, and is left out if records are lost.
     - The size of a window is bounded.
     - A record may arrive late, out of order or twice.
 """
@@ -58,20 +58,20 @@ _RAMP_MARGIN_S = 1.0
 class RecordWindow:
     """The newest records of one arm during a session, in arrays of fixed size.
 
-    When a record arrives, the oldest one is overwritten, so that a long session needs bounded
-    memory. The energy function of the session is computed from these records.
+    A new record overwrites the oldest one, so a long session needs only bounded memory. The
+    energy function of the session is computed from these records.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: The scenario of the session.
         site: Name of the site.
-        kept_s: Least time that the window reaches back, in s.
+        kept_s: Minimum time span that the window covers, in s.
 
     Attributes:
         site: Name of the site.
         rate_hz: Tick rate of the site, in Hz.
-        peers: Names of the site's peers, whose states it receives.
+        peers: Names of the site's peers.
         first: Oldest tick of the window.
-        newest: Newest recorded tick. -1 before the first record.
+        newest: Newest recorded tick, or -1 before the first record.
     """
 
     def __init__(self, scenario: Scenario, site: str, kept_s: float = KEPT_S) -> None:
@@ -113,9 +113,9 @@ class RecordWindow:
         self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Stores the record of one control period in the row of its tick.
+        """Stores a record in the row of its tick.
 
-        Records come over the network, and may therefore arrive in any order.
+        Records arrive over the network, possibly out of order.
 
         Args:
             record: The record.
@@ -168,26 +168,26 @@ class RecordWindow:
         self.first = first
 
     def has_record(self, tick: int) -> bool:
-        """Returns True if the record of a control period (tick) has arrived and is stored.
+        """Returns True if the record of a tick has arrived and is stored.
 
         Args:
-            tick: Number of the tick, a period of the control loop.
+            tick: Number of the tick.
         """
         if not self.first <= tick <= self.newest:
             return False
         return bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
-        """Returns the records of a range of ticks (control periods) as arrays.
+        """Returns the records of a range of ticks as arrays.
 
-        Missing records are interpolated, and marked.
+        Missing records are interpolated.
 
         Args:
             first: First tick.
-            last: Last tick.
+            last: Last tick, included.
 
         Returns:
-            The records. `known` is False for the missing ones.
+            The records. `known` is False in the rows of missing records.
         """
         first_row = first - self.first
         end_row = last + 1 - self.first
@@ -233,10 +233,10 @@ class RecordWindow:
 
 
 class EnergyCourse(NamedTuple):
-    """The energy function V of the stability proof, over a span of time of a running session.
+    """The energy function V of the stability proof over one time span of a running session.
 
-    A live display shows V and the energy that was supplied: V may rise only by the supplied
-    energy.
+    A live display plots V together with the supplied energy, the only amount by which V may
+    rise.
 
     Attributes:
         t_s: Times of the ticks of the site with the highest tick rate, shape (T,), in s.
@@ -253,18 +253,18 @@ class EnergyCourse(NamedTuple):
 class RunningEnergy:
     """Computes the energy function V of the stability proof while a session is running.
 
-    A rise of V warns the user early of instability. V is computed for one span of time after
-    the other, as soon as all records of a span have arrived.
+    A rise of V is an early warning of instability. V is computed for one time span after
+    another, as soon as all records of a span have arrived.
 
     Args:
-        scenario: The description of the experiment.
-        kept_s: Least time that the windows reach back, in s.
+        scenario: The scenario of the session.
+        kept_s: Minimum time span that the windows cover, in s.
 
     Attributes:
-        windows: The newest records of every site, by name. Whoever receives records stores them
-            there during the session.
-        missing: Sites for which the law or the arm has no functional, grouped by the reason.
-            V cannot be computed then.
+        windows: The newest records of every site, keyed by site name. The receiver of the
+            records stores them here during the session.
+        missing: Sites whose law or arm has no energy function, grouped by reason. V cannot be
+            computed in that case.
         degrades: True if shares change when a peer is lost, in which case V is not computed.
         closed_groups: Names of the sites in two groups that do not follow each other, in which
             case V is not defined. Empty as long as there are none.
@@ -284,13 +284,12 @@ class RunningEnergy:
         self._supplied = 0.0
 
     def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
-        """Takes into account commands that changed how strongly a site follows its peers.
+        """Applies commands that changed the dominance factors of a site.
 
-        The weights with which a site follows its peers, other sites, are its dominance factors.
         Other changes are ignored, because they have no effect on the energy.
 
         Args:
-            site: Name of the site, the process that runs one arm.
+            site: Name of the site.
             changes: The changes that the site carried out.
         """
         ramps = self._dominance[site].ramps
@@ -303,11 +302,11 @@ class RunningEnergy:
         whether V rises.
 
         Args:
-            complete: For every site, the number of the last tick for which nothing is missing
-                any more: each record up to this tick has arrived, or is known to be lost.
+            complete: For every site, the number of the last complete tick: every record up to
+                this tick has either arrived or is known to be lost.
 
         Returns:
-            V over the new span of time. `None` if the span is too short yet, or if V cannot be
+            V over the new time span, or `None` if the span is still too short or V cannot be
             computed in it.
         """
         has_no_energy = bool(self.missing or self.degrades or self.closed_groups)

@@ -2,13 +2,13 @@
 
 A metric is a number that describes a run or a part of it, for example the largest motor torque
 of one arm. The other modules of this folder define the metrics. `LogMetrics` collects their
-values. `trilat metrics` prints them.
+values, and `trilat metrics` prints them.
 
 Invariant:
-    - Each metric is present for each arm, link, wall or run to which it applies: as a number,
-      or with the reason why the number is missing.
-    - In JSON a missing number is null, and the key `unknown` has the reason.
-    - A comparison has a column for each log and a row for each metric of the whole run.
+    - Each metric is present for each arm, link, wall or run to which it applies, either as a
+      number or with the reason why it is missing.
+    - In JSON a missing value is null, and the key `unknown` contains the reason.
+    - A comparison has one column per log and one row per metric of the whole run.
 """
 
 import math
@@ -31,7 +31,7 @@ from ..site_signals import follows_in_task_space
 from . import static_windows
 from .measured_impedance import FrequencyResponse, ImpedanceEstimate
 from .measures import Measure, Metric, MetricValues, Quantity
-from .motion_metrics import ParameterEstimates
+from .motion_metrics import ParameterEstimates, measure_undelayed_error
 from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
 # every file of this folder declares its metrics when it is imported
@@ -62,23 +62,23 @@ class LogMetrics(Result):
     A metric is a number with a name and a unit. `LogMetrics.of_log` computes all metrics.
 
     Attributes:
-        log: Name of the file of the log.
+        log: File name of the log.
         scenario: Name of the scenario.
         driver: How the run was executed: "live" or "virtual".
         complete: True if the log was closed properly.
         run: Metrics of the whole run.
-        sites: Metrics of each site, by name.
-        links: Metrics of each link, by a name such as "m1->s".
+        sites: Metrics of each site, keyed by site name.
+        links: Metrics of each link, keyed by a name such as "m1->s".
         walls: Metrics of each wall. "s/1" is the first wall of site s.
         estimates: Estimates of the arm parameters, for each site with records.
-        static_windows: Number of windows of time in which all arms rest.
+        static_windows: Number of time windows in which all arms are at rest.
         joint_loads: Torques of all loaded sites at each loaded joint, in each static window.
         sharing_ratios: Force sharing at each joint at which two sites are loaded.
-        stiffness: Stiffness that an operator felt between successive static windows.
+        stiffness: Stiffness that an operator felt between consecutive static windows.
         responses: Impedances and reflections over frequency.
-        axes: Names of the shared coordinates in task space, where the number of a joint stands
-            for a coordinate. Empty in joint space.
-        joint_names: Names of the joints, if the files of all arms have the same names. Empty
+        axes: Names of the shared coordinates in task space, where joint numbers stand for
+            coordinates. Empty in joint space.
+        joint_names: Names of the joints, if they are the same in the files of all arms. Empty
             otherwise.
     """
 
@@ -105,14 +105,14 @@ class LogMetrics(Result):
     def of_log(cls, log: Log) -> "LogMetrics":
         """Computes all metrics of a recorded run, such as the largest error of each arm.
 
-        The log may be torn, short or empty. A number that the log does not determine is
+        The log may be truncated, short or empty. A value that the log does not determine is
         replaced by the reason.
 
         Args:
             log: The log of the run.
 
         Raises:
-            LogError: A record cannot be read, or names a change that is not valid.
+            LogError: A record cannot be read, or names an invalid change.
         """
         view = RunView(log)
         scenario = log.scenario
@@ -145,13 +145,13 @@ class LogMetrics(Result):
 
     @classmethod
     def find_quantity(cls, key: str) -> Quantity:
-        """Returns name, unit and meaning of the metric with a key such as "rms_error_rad".
+        """Returns the name, unit and meaning of the metric with a key such as "rms_error_rad".
 
         Args:
-            key: Key of the metric, under which JSON output and tables contain it.
+            key: Key of the metric in JSON output and tables.
 
         Raises:
-            KeyError: No metric has this key. The message names the most similar key.
+            KeyError: No metric has this key. The message suggests the most similar key.
         """
         known = {quantity.key: quantity for quantity in Quantity.list_all()}
         if key not in known:
@@ -165,10 +165,10 @@ class LogMetrics(Result):
     @staticmethod
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in of_log
     def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-        """Computes only some quantities of a whole run, which is faster than all of them.
+        """Computes only some quantities of a run, which is faster than computing all of them.
 
-        Other commands need a few quantities of many runs, for example to compare the points of
-        a sweep.
+        Commands use this to compare a few quantities across many runs, for example the points
+        of a sweep.
 
         Args:
             log: The log of the run.
@@ -178,8 +178,8 @@ class LogMetrics(Result):
             The metrics of the run, by key.
 
         Raises:
-            KeyError: No quantity has one of the keys.
-            LogError: A record cannot be read, or names a change that is not valid.
+            KeyError: One of the keys is not the key of a quantity.
+            LogError: A record cannot be read, or names an invalid change.
         """
         requested = {key: LogMetrics.find_quantity(key) for key in keys}
         needed_measures = []
@@ -197,10 +197,43 @@ class LogMetrics(Result):
             run_values[key] = _reduce_to_run(quantity, values_by_subject)
         return run_values
 
-    def label(self, number: int) -> str:
-        """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".
+    @staticmethod
+    def find_undelayed_maxima(
+        log: Log, sites: Iterable[str], other: Log | None = None
+    ) -> dict[str, float]:
+        """Finds the largest distance of each site from its peers at the same time.
 
-        The name of a joint is added to its number if all arms have the same joint names.
+        The tracking error compares a site with samples that its peers sent some time ago. This
+        distance, in contrast, includes the effect of the delay.
+
+        Args:
+            log: The log of the run.
+            sites: Names of the sites.
+            other: Log of a run with the same sites, such as a rerun. If given, only times are
+                used at which this run also has a record of the site.
+
+        Returns:
+            The largest distance by site, in rad, or in m if the sites share positions. Sites
+            for which this distance does not exist, for example because they follow no other
+            site, are missing.
+
+        Raises:
+            LogError: A record cannot be read, or names an invalid change.
+        """
+        view = RunView(log)
+        maxima = {}
+        for site in sites:
+            is_angle = log.scenario.sites[site].task.space == "joints"
+            key = "undelayed_max_rad" if is_angle else "undelayed_max_m"
+            distance = measure_undelayed_error(view, site, other)[key].value
+            if distance is not None:
+                maxima[site] = distance
+        return maxima
+
+    def label(self, number: int) -> str:
+        """Returns the name of a joint or axis for a table, such as "1", "3 elbow" or "x".
+
+        The name of a joint is appended to its number if all arms have the same joint names.
 
         Args:
             number: Number of the joint or axis, from 1.
@@ -212,10 +245,10 @@ class LogMetrics(Result):
         return str(number)
 
     def unit(self, joint_unit: str, number: int) -> str:
-        """Returns the unit of a quantity, which may belong to a joint or to an axis in space.
+        """Returns the unit of a quantity at a joint or along a spatial axis.
 
-        For arms whose end effectors follow each other, the first three numbers are axes of
-        space. A quantity in N m at a joint is then a force in N, for example.
+        If the arms follow each other with their end effectors, the first three numbers stand
+        for spatial axes. A quantity in N m at a joint is then, for example, a force in N.
 
         Args:
             joint_unit: Unit of the quantity at a joint.
@@ -228,7 +261,7 @@ class LogMetrics(Result):
     def headline(self) -> str:
         """Returns one line with the log, the number of known values, and the sites.
 
-        For example "run.mcap: 84 numbers of paper, m1, m2, s".
+        An example is "run.mcap: 84 numbers of paper, m1, m2, s".
         """
         known = 0
         for _, metric in self._list_values():
@@ -240,8 +273,9 @@ class LogMetrics(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns the metrics as plain values, with the keys of `trilat metrics --json`.
 
-        Each subject has its own dictionary: `["sites"]["m1"]` has the metrics of site m1 by
-        key. A value that is not known is `None`, and the entry "unknown" has the reason.
+        Each subject has its own dictionary: `["sites"]["m1"]` maps the keys of metrics to their
+        values for site m1. An unknown value is `None`, and the entry "unknown" contains the
+        reason.
         """
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
@@ -296,9 +330,9 @@ class LogMetrics(Result):
         return reasons
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table with a row for each quantity and each subject that has the quantity.
+        """Returns a table with one row per quantity and subject.
 
-        A subject is the run, a site, a link or a wall. A row has the keys "group", "key",
+        A subject is the run, a site, a link or a wall. Each row has the keys "group", "key",
         "name", "of" (the subject), "unit", "value", and "why" (the reason if the value is
         `None`).
         """
@@ -323,9 +357,9 @@ class LogMetrics(Result):
                 yield description, metric
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
-        """Returns the values of one metric for every subject that has the metric, by subject.
+        """Returns the values of one metric, keyed by subject.
 
-        A subject is an arm, a network link or a wall, or the whole run, whose name is empty.
+        A subject is an arm, a link, a wall, or the whole run, whose name is empty.
 
         Args:
             quantity: The quantity.
@@ -337,10 +371,10 @@ class LogMetrics(Result):
         return {name: metrics[key] for name, metrics in metrics_by_name.items()}
 
     def run_value(self, quantity: Quantity) -> Metric:
-        """Returns one number of a metric for the whole run, such as the largest of all errors.
+        """Returns the value of a metric for the whole run, such as the largest of all errors.
 
-        Numbers of arms, network links or walls are reduced to their maximum or sum, see
-        `_reduce_to_run`.
+        The values of arms, links or walls are reduced to their maximum or sum (see
+        `_reduce_to_run`).
 
         Args:
             quantity: The quantity.

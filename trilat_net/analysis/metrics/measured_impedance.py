@@ -1,22 +1,23 @@
-"""Estimates the impedance that an operator feels at an arm, from the records of a run.
+"""Estimates the impedance that an operator feels at an arm from the records of a run.
 
 The impedance is the ratio of the operator's torque to the velocity of the arm, as a function of
 frequency: a large impedance feels stiff or heavy. The module also estimates the force
-reflection: the share of the environment's torque on another arm that reaches the operator.
+reflection, which is the fraction of the environment's torque on another arm that reaches the
+operator.
 
-In a closed loop, each of the two signals x and y of such a ratio depends on the other, and
-their plain ratio would be biased. Therefore a third signal d, the drive, is needed, which
-depends on nothing else, such as the operator's planned torque. The ratio y / x at a frequency
-is S_dy / S_dx, where S is a cross-spectrum. docs/reference/metrics.md names the drives and the
+In a closed loop, the two signals x and y of such a ratio depend on each other, and their plain
+ratio would be biased. The estimate therefore needs a third signal d, the drive, which depends
+on no other signal, such as the operator's planned torque. The ratio y / x at a frequency is
+S_dy / S_dx, where S is a cross-spectrum. docs/reference/metrics.md names the drives and the
 literature.
 
 Invariant:
-    - A ratio is given at the frequency with the strongest drive, and at all frequencies whose
-      drive is at least 0.55 times as strong.
+    - A ratio is reported at the frequency with the strongest drive, and at all frequencies
+      whose drive is at least 0.55 times as strong.
     - A ratio is accepted only if at least `MIN_SEGMENTS` independent segments of the run excite
       the frequency, and if both signals have a coherence of at least `MIN_COHERENCE` with the
       drive. These two limits keep its relative random error to at most 17.2 %.
-    - Otherwise the reason is given instead of the ratio.
+    - Otherwise the reason is reported instead of the ratio.
 """
 
 import math
@@ -62,8 +63,8 @@ NO_SCRIPT_TEXT = "the scenario does not contain the hand's intention: the drive 
 class FrequencyResponse(NamedTuple):
     """Ratio of two recorded signals at one frequency, such as torque over velocity.
 
-    Both signals are caused by a known drive, the motion of an operator. Values that the log
-    does not determine are `None`.
+    Both signals are caused by a known drive, such as the motion of an operator. Values that the
+    log does not determine are `None`.
 
     Attributes:
         frequency_hz: Frequency of the spectral line, in Hz.
@@ -97,21 +98,21 @@ class FrequencyResponse(NamedTuple):
     ) -> "list[FrequencyResponse]":
         """Estimates the ratio of an output to an input at every frequency that is driven.
 
-        Both signals are caused by a third one, the drive, and are compared through their cross
-        spectra with it. `scipy.signal.csd` is not used, because it cannot leave out segments
+        Both signals are caused by a third one, the drive, and are compared through their
+        cross-spectra with it. `scipy.signal.csd` is not used, because it cannot skip segments
         with unusable rows.
 
         Args:
             drive: The signal that causes both and depends on no other signal, shape (K,).
             put_in: The input signal, shape (K,).
             came_out: The output signal, shape (K,).
-            usable: True for rows that are recorded while no other drive is active, shape (K,).
+            usable: True for recorded rows in which no other drive is active, shape (K,).
             rate_hz: Rows per second.
-            least: Least amplitude of the drive at which a frequency counts as driven.
+            least: Smallest drive amplitude at which a frequency counts as driven.
 
         Returns:
-            The responses, the one with the strongest drive first. If no frequency is driven, a
-            single response that contains the reason.
+            The responses, beginning with that of the strongest drive. If no frequency is
+            driven, a single response that contains the reason.
         """
         length = round(SEGMENT_S * rate_hz)
         starts = _find_segments(usable, length)
@@ -277,12 +278,12 @@ class ImpedanceEstimate(NamedTuple):
             joint velocity, in N m s/rad. It includes the effect of all coupled arms. A
             reflection is the torque that an operator feels, divided by the torque of the
             environment on another arm.
-        at: Site of the operator, which is the process that runs the operator's arm.
+        at: Site of the operator.
         of: Site of the environment, for a reflection. Empty for an impedance.
         joint: Number of the joint, from 1.
-        ratio: The complex ratio at the frequency at which the arm is driven most.
-        spectrum: The ratios at all frequencies that are sufficiently driven, by rising
-            frequency.
+        ratio: The complex ratio at the frequency with the strongest drive.
+        spectrum: The ratios at all frequencies that are sufficiently driven, in ascending order
+            of frequency.
     """
 
     kind: str
@@ -294,7 +295,7 @@ class ImpedanceEstimate(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of the ratio: "N m s/rad" for an impedance, which is torque per velocity.
+        """Unit of the ratio: "N m s/rad" for an impedance (torque per velocity).
 
         Empty for a reflection, which is a ratio of two torques.
         """
@@ -302,10 +303,10 @@ class ImpedanceEstimate(NamedTuple):
 
     @classmethod
     def list_of_run(cls, view: RunView) -> "list[ImpedanceEstimate]":
-        """Estimates what each operator feels over frequency, from a recorded run.
+        """Estimates what each operator feels, over frequency, from a recorded run.
 
-        For each operator the impedance is estimated, the operator's torque over the velocity of
-        the joint. For each environment at another arm the reflection is estimated, the torque
+        For each operator, the impedance is estimated: the operator's torque over the joint
+        velocity. For each environment at another arm, the reflection is estimated: the torque
         that the operator feels over the torque of the environment.
 
         Args:

@@ -1,9 +1,9 @@
-"""Registers functions as metrics, so that tables and commands find them by name.
+"""Registers functions as metrics, which tables and commands then look up by name.
 
 A metric is a number that describes a run or a part of it, for example the RMS error of an arm.
 Each module of this folder contains functions that compute such numbers. The decorator
 `measures` registers a function together with the quantities that it returns (their names, units
-and meanings). A new metric therefore needs no change of the commands that print metrics.
+and meanings). A new metric therefore requires no change of the commands that print metrics.
 
 Invariant:
     - A value is a finite number, or `None` with a reason.
@@ -22,13 +22,15 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import POSITION, Array
 from ..run_view import RunView
 
+_NOT_FINITE = "the number is not finite"
+
 
 class Metric(NamedTuple):
     """Value of a metric, such as the largest error of an arm, or the reason why it is missing.
 
     Attributes:
-        value: The finite number. `None` if the metric has no number.
-        why: The reason why there is no number. Empty if there is a number.
+        value: The finite value, or `None` if it is missing.
+        why: The reason why the value is missing. Empty if it is not missing.
         applies: False if the quantity cannot exist for this subject in any run of this
             scenario. In that case no information is missing.
     """
@@ -37,25 +39,24 @@ class Metric(NamedTuple):
     why: str = ""
     applies: bool = True
 
+    @classmethod
+    def of_value(cls, value: float | None, why: str = _NOT_FINITE) -> "Metric":
+        """Wraps a value in a metric, with a reason if the value is missing or not finite.
+
+        For example, NaN and the reason "no contact" give a metric with the value `None` and
+        this reason.
+
+        Args:
+            value: The value, or `None` if it is missing.
+            why: The reason stated if the value is `None` or not finite.
+        """
+        if value is None or not math.isfinite(value):
+            return cls(None, why)
+        return cls(float(value))
+
 
 MetricValues = dict[str, Metric]
 """Metrics of one subject, by the keys of their quantities."""
-
-_NOT_FINITE = "the number is not finite"
-
-
-def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Wraps a number in a metric. If the number is missing or not finite, a reason is added.
-
-    For example, metric(nan, "no contact") has the value `None` and the reason "no contact".
-
-    Args:
-        value: The number. `None` if the metric has no number.
-        why: The reason that is stated if the number is `None` or not finite.
-    """
-    if value is None or not math.isfinite(value):
-        return Metric(None, why)
-    return Metric(float(value))
 
 
 def unavailable(
@@ -65,19 +66,20 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns metrics without values, with a common reason, for all quantities under a heading.
+    """Returns metrics without values, all with the same reason, for the quantities of a group.
 
     For example, a function that measures tracking returns them if an arm has no records.
 
     Args:
-        group: Group of the quantities.
+        group: Group (heading) of the quantities.
         why: The reason why there are no values.
         of: If not empty, only quantities of this kind of subject are returned: "run", "site",
             "link" or "wall".
-        applies: False if the quantities cannot exist in any run of this scenario, see `Metric`.
+        applies: False if the quantities cannot exist in any run of this scenario (see
+            `Metric`).
 
     Returns:
-        The metrics, by key of the quantity.
+        The metrics, keyed by quantity.
     """
     return {
         quantity.key: Metric(None, why, applies)
@@ -96,9 +98,8 @@ def measure_shared(
 ) -> MetricValues:
     """Measures how far the motions of two sites differ: RMS, peak, and peak at the end.
 
-    Sites share joint angles in rad, positions of their end effectors in m, or whole poses,
-    which have both units. The quantities of a unit that does not occur are marked as not
-    applicable.
+    Sites share joint angles in rad, positions of their end effectors in m, or complete poses,
+    which have both units. Quantities whose unit does not occur are marked as not applicable.
 
     Args:
         group: Group of the quantities.
@@ -106,10 +107,10 @@ def measure_shared(
         keys: Keys of the three quantities, without the unit.
         differences: Differences in every row, shape (K, n).
         at_end: True for rows of the last second, shape (K,).
-        why_not_at_end: The reason that is stated if no row is at the end.
+        why_not_at_end: The reason stated if no row is at the end.
 
     Returns:
-        The metrics, by quantity.
+        The metrics, keyed by quantity.
     """
     columns_by_unit = {"rad": slice(None)}
     why_excluded = "sites share angles, not places"
@@ -123,9 +124,9 @@ def measure_shared(
     for unit, columns in columns_by_unit.items():
         unit_differences = differences[:, columns]
         unit_metrics = (
-            metric(rms(unit_differences)),
-            metric(peak(unit_differences)),
-            metric(peak(unit_differences[at_end]), why_not_at_end),
+            Metric.of_value(rms(unit_differences)),
+            Metric.of_value(peak(unit_differences)),
+            Metric.of_value(peak(unit_differences[at_end]), why_not_at_end),
         )
         for key, value in zip(keys, unit_metrics, strict=True):
             values[f"{key}_{unit}"] = value
@@ -135,13 +136,14 @@ def measure_shared(
 def rms(values: ArrayLike) -> float:
     """Returns the root mean square over time of the worst column, such as the worst joint.
 
-    Each column has the values of one joint. The largest of the columns' values is returned.
+    Each column contains the values of one joint. The largest root mean square of all columns is
+    returned.
 
     Args:
         values: Values of n quantities over time, shape (K, n).
 
     Returns:
-        The largest root mean square. NaN if there are no rows.
+        The largest root mean square, or NaN if there are no rows.
     """
     numbers = np.asarray(values, dtype=np.float64)
     if not numbers.size:
@@ -155,17 +157,17 @@ def peak(values: ArrayLike) -> float:
     """Returns the largest absolute value, such as the peak torque. For [1, -3] it is 3.
 
     Args:
-        values: The numbers, of any shape.
+        values: The values, of any shape.
 
     Returns:
-        The largest absolute value. NaN if there are no numbers.
+        The largest absolute value, or NaN if there are no values.
     """
     magnitudes = np.asarray(values, dtype=np.float64)
     return float(np.abs(magnitudes).max()) if magnitudes.size else math.nan
 
 
 class Quantity(NamedTuple):
-    """Definition of a metric: its key, name and unit, and to what it applies.
+    """Definition of a metric: its key, name, unit, and the kind of subject to which it applies.
 
     For example, the RMS error has the unit rad and applies to each arm.
 
@@ -173,7 +175,8 @@ class Quantity(NamedTuple):
         key: Key in programs. It ends in the unit if the quantity has a unit.
         name: Name that users read.
         unit: Unit. Empty for a dimensionless number.
-        reduction: How the number of the run follows from those of its subjects: "max" or "sum".
+        reduction: How the value of the run is computed from those of its subjects: "max" or
+            "sum".
         of: Kind of subject: "run", "site", "link" or "wall".
         group: Heading under which the quantity is shown.
     """
@@ -201,11 +204,12 @@ class Quantity(NamedTuple):
         in m. Each quantity is therefore defined twice.
 
         Args:
-            names: Names that the user reads, by key. The unit is appended to each key. "{0}" in
-                a name is replaced by the symbol q for angles or x for positions.
+            names: A mapping from key to the name that the user reads. The unit is appended to
+                each key. "{0}" in a name is replaced by the symbol q for angles or x for
+                positions.
 
         Returns:
-            The quantities of angles, and then the quantities of positions.
+            The quantities of angles, followed by those of positions.
         """
         symbols = {"rad": "q", "m": "x"}
         return [
@@ -221,7 +225,7 @@ _DeclaredMeasuring = TypeVar("_DeclaredMeasuring", bound=Measuring)
 
 
 class Measure(NamedTuple):
-    """A function that computes some metrics of a run, with their heading in tables.
+    """A function that computes some metrics of a run, together with their heading in tables.
 
     Modules of this folder register such functions with the decorator `measures`.
 
@@ -239,10 +243,10 @@ class Measure(NamedTuple):
 
     @classmethod
     def list_all(cls) -> "list[Measure]":
-        """Returns all registered functions that measure quantities, ordered by group.
+        """Returns all registered functions that compute metrics, ordered by group.
 
-        The groups have the order in which they are shown to the user. Groups that are not in
-        this order, such as those of a new file, are last.
+        Groups are sorted in the order in which they are shown to the user. Unknown groups, such
+        as those of a new file, come last.
         """
         rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
         return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
@@ -281,10 +285,10 @@ _GROUP_ORDER = (
 def measures(
     of: str, group: str, *quantities: Quantity
 ) -> Callable[[_DeclaredMeasuring], _DeclaredMeasuring]:
-    """Decorator that registers a function which measures some quantities.
+    """Decorator that registers a function that computes some metrics.
 
-    The function is called for each run, site (the process that runs one arm), link or wall,
-    depending on `of`. It must return a metric for each of the quantities.
+    The function is called for each run, site, link or wall, depending on `of`, and must return
+    a metric for each of the quantities.
 
     Args:
         of: Kind of subject that the function measures: "run", "site", "link" or "wall".
@@ -292,7 +296,7 @@ def measures(
         quantities: The quantities. Their attributes `of` and `group` are filled in.
 
     Raises:
-        ValueError: Another function measures one of the quantities.
+        ValueError: Another function already computes one of the quantities.
     """
 
     def declare(measure: _DeclaredMeasuring) -> _DeclaredMeasuring:

@@ -2,13 +2,12 @@
 
 A metric is a number that describes a recorded run or a part of it, for example the RMS tracking
 error of the slave arm in rad. The tracking error is the difference between the joint angles of
-an arm and the weighted mean of the angles of the arms that it follows, which arrive with a
-delay. docs/reference/metrics.md defines every metric.
+an arm and the weighted mean of its peers' angles, which arrive with a delay.
+docs/reference/metrics.md defines every metric.
 
 Invariant:
-    - The tracking error includes the network delay. The largest distance between the arms
-      (spread) is computed at the same instant. A slave is compared with its master at the time
-      at which the state that it uses was sent.
+    - The tracking error compares a slave with its master at the time when the state in use was
+      sent. The largest distance between the arms (spread) compares all arms at one instant.
     - The effort is computed from the recorded motor torque, after the torque limit and with
       gravity compensation.
     - The force of a wall is computed from the scenario and the recorded motion. Ticks without a
@@ -23,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core import POSE, POSITION, Array, Law
-from ...log import RotationVectors, compute_task_errors
+from ...log import Log, RotationVectors, compute_task_errors
 from ...results import JsonObject
 from ...scenario import END_WINDOW_S, Scenario
 from .. import site_signals
@@ -32,9 +31,8 @@ from ..arm_rows import (
     ArmRows,
     PlanarArmRows,
     build_arm_rows,
-    find_base_parameters,
-    find_consistent_links,
 )
+from ..base_parameters import find_base_parameters, find_consistent_links
 from ..file_overview import describe_site_health
 from ..run_view import RunView
 from .measures import (
@@ -52,7 +50,6 @@ from .measures import (
     Quantity,
     measure_shared,
     measures,
-    metric,
     peak,
     rms,
     unavailable,
@@ -108,32 +105,30 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
         differences=site_signals.joint_errors(site_log),
         at_end=site_log.t_s > site_log.t_s[-1] - END_WINDOW_S,
     )
-    metrics["settle_s"] = metric(
+    metrics["settle_s"] = Metric.of_value(
         site_signals.settling_time_s(site_log), f"|e| exceeds {limit} in the last record"
     )
     return metrics
 
 
 @measures("site", UNDELAYED, *Quantity.list_shared(_UNDELAYED_ERRORS))
-def measure_undelayed_error(
-    view: RunView, site: str, other: RunView | None = None
-) -> MetricValues:
-    """Measures how far a site is from where its peers are at the same time.
+def measure_undelayed_error(view: RunView, site: str, other: Log | None = None) -> MetricValues:
+    """Measures how far a site is from its peers at the same time.
 
-    The error e of a site compares its coordinates with what its peers sent some time ago. The
-    undelayed error compares them with the peers' coordinates at the same time t, weighted by
-    the dominance factors:
+    The error e of a site compares its coordinates with those that its peers sent some time ago.
+    The undelayed error compares them with the peers' coordinates at the same time t, weighted
+    by the dominance factors:
 
         q_i(t) - sum_j alpha_ij(t) q_j(t)
 
-    It therefore includes the effect of the delay. Between the ticks of a peer the peer's motion
-    is interpolated.
+    It therefore includes the effect of the delay. The motion of a peer is interpolated between
+    its ticks.
 
     Args:
         view: The run.
         site: Name of the site.
-        other: A run with the same sites, such as a rerun, which may end earlier. If given, only
-            times at which this run also has a record of the site are used.
+        other: Log of a run with the same sites, such as a rerun, which may end earlier. If
+            given, only times are used at which this run also has a record of the site.
     """
     followed = _list_followed_peers(view, site)
     missing = [name for name in (site, *followed) if name not in view.sites]
@@ -142,11 +137,13 @@ def measure_undelayed_error(
     if not followed:
         return unavailable(UNDELAYED, f"{site} follows no other site", applies=False)
     error, known = _compute_undelayed_error(view, site, followed)
-    if other is not None and site in other.sites:
-        # Equal times of different tick rates are equal floats: a division rounds correctly.
-        other_records = other.sites[site].records
-        other_t_s = other_records.t_s[other_records.known]
-        known &= np.isin(view.sites[site].records.t_s, other_t_s)
+    if other is not None:
+        # As in aligned records, the last record of a diverged site does not count.
+        other_log = other[site]
+        other_ticks = other_log.tick[other_log.mode != "diverged"]
+        if len(other_ticks):
+            # Equal times of different tick rates are equal floats: a division rounds correctly.
+            known &= np.isin(view.sites[site].records.t_s, other_ticks / other_log.rate_hz)
     if not known.any():
         return unavailable(UNDELAYED, "there is no time at which every site has a record")
     return measure_shared(
@@ -342,11 +339,11 @@ def _measure_effort(view: RunView, site: str) -> MetricValues:
 
     sum_of_squares = float(np.einsum("kj,kj->", tau, tau))
     return {
-        "effort_nm2_s": metric(sum_of_squares / part.rate_hz),
-        "rms_tau_nm": metric(rms(tau)),
-        "peak_tau_nm": metric(peak(tau)),
-        "saturated_share": metric(float(at_limit.mean())),
-        "chatter_nm": metric(chatter, "no two ticks"),
+        "effort_nm2_s": Metric.of_value(sum_of_squares / part.rate_hz),
+        "rms_tau_nm": Metric.of_value(rms(tau)),
+        "peak_tau_nm": Metric.of_value(peak(tau)),
+        "saturated_share": Metric.of_value(float(at_limit.mean())),
+        "chatter_nm": Metric.of_value(chatter, "no two ticks"),
     }
 
 
@@ -393,15 +390,15 @@ def _measure_wall_contact(view: RunView, name: str) -> MetricValues:
 
     # depths are negative outside the wall
     metrics = {
-        "contact_share": metric(float(touches[known].mean())),
-        "depth_max_m": metric(max(0.0, float(depth.max()))),
+        "contact_share": Metric.of_value(float(touches[known].mean())),
+        "depth_max_m": Metric.of_value(max(0.0, float(depth.max()))),
     }
     at_end = known & (t_s > t_s[known][-1] - LONG_END_S)
     for prefix, rows in (("", known), ("end_", at_end)):
-        metrics[f"{prefix}force_mean_n"] = metric(float(force[rows].mean()))
-        metrics[f"{prefix}force_deviation_n"] = metric(float(force[rows].std()))
-        metrics[f"{prefix}force_peak_n"] = metric(float(force[rows].max()))
-        metrics[f"{prefix}hits"] = metric(float(np.count_nonzero(is_hit[rows])))
+        metrics[f"{prefix}force_mean_n"] = Metric.of_value(float(force[rows].mean()))
+        metrics[f"{prefix}force_deviation_n"] = Metric.of_value(float(force[rows].std()))
+        metrics[f"{prefix}force_peak_n"] = Metric.of_value(float(force[rows].max()))
+        metrics[f"{prefix}hits"] = Metric.of_value(float(np.count_nonzero(is_hit[rows])))
     return {key: metrics[key] for key in unavailable(CONTACT, "")}  # in the declared order
 
 
@@ -432,18 +429,18 @@ class _BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """Estimates of an arm's dynamic parameters theta that an adaptive control law learnt.
+    """Estimates of an arm's dynamic parameters theta, as learnt by an adaptive control law.
 
     The parameters combine masses, inertias and lengths of the links. Each array has shape (P,).
 
     Attributes:
         learnt: True for each parameter that the law adapts.
-        theta: True parameters. `None` if unknown.
+        theta: True parameters, or `None` if unknown.
         first: Estimates in the first record.
         last: Estimates in the last record.
-        slope_per_s: Slopes of straight lines through the last 5 s, in 1/s. `None` with fewer
-            than two records.
-        base: Estimates of a chain in base parameters. `None` for the planar arm.
+        slope_per_s: Slopes of straight lines fitted to the last 5 s, in 1/s, or `None` with
+            fewer than two records.
+        base: Estimates of a chain in base parameters, or `None` for the planar arm.
     """
 
     learnt: list[bool]
@@ -456,7 +453,7 @@ class ParameterEstimates(NamedTuple):
     def to_json(self) -> JsonObject:
         """Converts the estimates of the control law to plain values for JSON.
 
-        The key "base" is left out if there are no base parameters.
+        The key "base" is omitted if there are no base parameters.
         """
         content = self._asdict()
         del content["base"]
@@ -468,13 +465,13 @@ class ParameterEstimates(NamedTuple):
     def by_site(cls, view: RunView) -> "dict[str, ParameterEstimates]":
         """Reads the parameter estimates that adaptive control laws learnt during a run.
 
-        The result contains the first, the last and the true values of masses and inertias.
+        Each entry contains the first, last and true values of masses and inertias.
 
         Args:
             view: The run.
 
         Returns:
-            The estimates, by name of the site. Sites without records are missing.
+            A mapping from site name to estimates. Sites without records are missing.
         """
         return {
             site: _read_parameter_estimates(view.scenario, run.records)
@@ -606,12 +603,14 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
         learnt_slopes = np.array(estimates.slope_per_s)[learnt]
         slope = float(np.linalg.norm(learnt_slopes))
 
-    metrics["theta_slope_per_s"] = metric(slope, "fewer than two records in the last 5 s")
+    metrics["theta_slope_per_s"] = Metric.of_value(
+        slope, "fewer than two records in the last 5 s"
+    )
     metrics["unphysical_links"] = Metric(
         None, "the arm is not a chain with ten parameters per link", applies=False
     )
     if base is not None:
-        metrics["unphysical_links"] = metric(base.consistent_last.count(False))
+        metrics["unphysical_links"] = Metric.of_value(base.consistent_last.count(False))
 
     if estimates.theta is None:
         return metrics
@@ -629,8 +628,8 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
 
     distances = np.linalg.norm(errors, axis=1)
     for end, distance, energy in zip(("first", "last"), distances, energies, strict=True):
-        metrics[f"theta_error_{end}"] = metric(float(distance))
-        metrics[f"theta_energy_{end}_j"] = metric(energy, why)
+        metrics[f"theta_error_{end}"] = Metric.of_value(float(distance))
+        metrics[f"theta_energy_{end}_j"] = Metric.of_value(energy, why)
     return metrics
 
 
@@ -690,19 +689,19 @@ def _measure_network(view: RunView, name: str) -> MetricValues:
     age = link.age_ms
     unused = "no sample ever came into use"
     unknown = "for no sample is it known whether it arrived"
-    burst = metric(link.burst, unknown)
+    burst = Metric.of_value(link.burst, unknown)
     if link.loss == 0.0:
         burst = Metric(None, "nothing was lost", applies=False)
 
     late_samples = link.counts.late if link.counts else None
     return {
-        "age_mean_ms": metric(age.mean if age else None, unused),
-        "age_p99_ms": metric(age.p99 if age else None, unused),
-        "age_max_ms": metric(age.max if age else None, unused),
-        "silence_ms": metric(link.silence_ms, unused),
-        "loss": metric(link.loss, unknown),
+        "age_mean_ms": Metric.of_value(age.mean if age else None, unused),
+        "age_p99_ms": Metric.of_value(age.p99 if age else None, unused),
+        "age_max_ms": Metric.of_value(age.max if age else None, unused),
+        "silence_ms": Metric.of_value(link.silence_ms, unused),
+        "loss": Metric.of_value(link.loss, unknown),
         "burst": burst,
-        "late_samples": metric(late_samples, f"no records of {link.site}"),
+        "late_samples": Metric.of_value(late_samples, f"no records of {link.site}"),
     }
 
 
@@ -727,7 +726,7 @@ def _measure_loop(view: RunView, site: str) -> MetricValues:
         records has a value.
     """
     log = view.log
-    missing = {"missing": metric(log.missing(site))}
+    missing = {"missing": Metric.of_value(log.missing(site))}
 
     if log.driver != "live":
         return unavailable(LOOP, "no clock was read", applies=False) | missing
@@ -738,9 +737,9 @@ def _measure_loop(view: RunView, site: str) -> MetricValues:
     late_us = health["late_us"]
     busy_us = health["busy_us"]
     return {
-        "late_p99_us": metric(late_us["p99"]),
-        "late_max_us": metric(late_us["max"]),
-        "busy_p99_us": metric(busy_us["p99"] if busy_us else None, "no second record"),
-        "overruns": metric(health["overruns"]),
+        "late_p99_us": Metric.of_value(late_us["p99"]),
+        "late_max_us": Metric.of_value(late_us["max"]),
+        "busy_p99_us": Metric.of_value(busy_us["p99"] if busy_us else None, "no second record"),
+        "overruns": Metric.of_value(health["overruns"]),
         **missing,
     }

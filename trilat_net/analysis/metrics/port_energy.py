@@ -1,19 +1,19 @@
 """Computes the energy that enters each arm, and the energy that network delays inject.
 
 Delays can make coupled arms unstable, because the control torques then supply energy that no
-operator supplied. The metrics of this module show where this energy comes from. Energy enters
+operator supplied. The metrics in this module show where this energy comes from. Energy enters
 an arm from the controller, the operator and the environment. The work of a torque tau during a
 small motion dq of the joints is tau'dq. If the torque tau_k is constant during tick k, its work
 is exactly tau_k' (q_{k+1} - q_k), where q_k are the joint angles. If the torque follows the
-motion, the trapezoid rule is used, which is exact for springs. The sum of this work over the
+motion, the trapezoidal rule is used, which is exact for springs. The sum of this work over the
 ticks is known as a passivity observer (Hannaford and Ryu 2002).
 
 A link carries the state of arm j to arm i with the delay T_ij. The control torque of arm i is
-the torque without delay, plus a term for each link. The energy of this term is
+the torque without delay, plus one term per link. The energy of this term is
 
     E_ij = int qd_i' S_i ( p_j(t - T_ij) - p_j(t) ) dt
 
-Here qd_i is the joint velocity of arm i, p_j the signal that the law uses from arm j, such as
+where qd_i is the joint velocity of arm i, p_j the signal from arm j that the law uses, such as
 its position, and S_i the gain of the law for this signal. docs/reference/metrics.md lists p_j
 and S_i for each law, and the literature.
 """
@@ -26,13 +26,13 @@ from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows
 from ..following import build_following
 from ..run_view import RunView
-from .measures import ENERGY, Metric, MetricValues, Quantity, measures, metric, unavailable
+from .measures import ENERGY, Metric, MetricValues, Quantity, measures, unavailable
 
 _NO_FRICTION = Metric(None, "the joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that is constant within each control period, in J.
+    """Returns the work of a torque that is held constant within each tick period, in J.
 
     The work in period k is exactly tau_k' (q_{k+1} - q_k), whatever the motion within the
     period.
@@ -51,7 +51,7 @@ def held_work(torque: Array, q: Array) -> Array:
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque in each control period (tick), by the trapezoid rule.
+    """Returns the work of a torque in each tick period, computed with the trapezoidal rule.
 
     The torque is assumed to change linearly with the joint angle between two ticks.
 
@@ -151,7 +151,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
         return unavailable(ENERGY, "no two records in a row", of="site")
 
     def accumulate(work: Array) -> Array:
-        """Returns the sum of work over time. Periods without records count as zero."""
+        """Returns the cumulative work over time. Periods without records count as zero."""
         known_work = np.where(known, work, 0.0)
         return np.cumsum(known_work)
 
@@ -171,12 +171,12 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
     friction = accumulate(trapezoid_work(friction_torque, q))
 
     metrics = {
-        "controller_j": metric(controller[-1]),
-        "hands_j": metric(operator[-1]),
+        "controller_j": Metric.of_value(controller[-1]),
+        "hands_j": Metric.of_value(operator[-1]),
         "hands_most_j": _measure_most(operator),
     }
     if spec.environment or stop_torque.any():
-        metrics["walls_j"] = metric(walls[-1])
+        metrics["walls_j"] = Metric.of_value(walls[-1])
         metrics["walls_most_j"] = _measure_most(walls)
     else:
         no_walls = Metric(None, "the scenario has no environment at this site", applies=False)
@@ -185,7 +185,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
 
     metrics["friction_j"] = _NO_FRICTION
     if friction_torque.any():
-        metrics["friction_j"] = metric(friction[-1])
+        metrics["friction_j"] = Metric.of_value(friction[-1])
     if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
         return {**metrics, "mechanical_j": unknown, "unaccounted_j": unknown}
@@ -194,15 +194,15 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
     gained = accumulate(np.diff(energy))
     unaccounted = gained - controller - operator - walls + friction
     largest_unaccounted = np.abs(unaccounted).max()
-    metrics["mechanical_j"] = metric(gained[-1])
-    metrics["unaccounted_j"] = metric(float(largest_unaccounted))
+    metrics["mechanical_j"] = Metric.of_value(gained[-1])
+    metrics["unaccounted_j"] = Metric.of_value(float(largest_unaccounted))
     return metrics
 
 
 def _measure_most(energy: Array) -> Metric:
     """Returns the metric of the largest energy over time, in J, which is at least 0."""
     largest = float(energy.max())
-    return metric(max(0.0, largest))
+    return Metric.of_value(max(0.0, largest))
 
 
 @measures(
@@ -270,7 +270,7 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
     judged_work = np.where(is_judged, work, 0.0)
     injected = np.cumsum(judged_work)
     return {
-        "delay_j": metric(injected[-1]),
+        "delay_j": Metric.of_value(injected[-1]),
         "delay_most_j": _measure_most(injected),
     }
 

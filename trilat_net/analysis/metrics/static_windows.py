@@ -1,17 +1,17 @@
-"""Computes the stiffness that a user feels, from the times of a run in which all arms rest.
+"""Computes the stiffness that a user feels from intervals in which all arms are at rest.
 
-A time in which all arms rest under constant torques is called a static window. The stiffness is
-the ratio of the changes of torque and angle between two static windows.
+An interval in which all arms are at rest under constant torques is called a static window. The
+stiffness is the ratio of the changes of torque and angle between two static windows.
 
-The module also computes how the arms share a force: an operator holds one arm while a torque
-acts on another arm. At rest the torques tau_i on the arms satisfy
+The module also computes how the arms share a force when an operator holds one arm while a
+torque acts on another arm. At rest, the torques tau_i on the arms satisfy
 
     sum_i (pi_i / K_i) tau_i = 0   for every joint
 
 This equation predicts the torque that the operator feels. pi is the left eigenvector, for the
-eigenvalue 1 (Perron vector), of the matrix of the weights with which the arms follow each
-other. K_i is the stiffness, in N m/rad, with which the controller of arm i pulls its arm to the
-position that it follows. docs/reference/metrics.md derives each metric.
+eigenvalue 1 (Perron vector), of the matrix of dominance factors. K_i is the stiffness, in N
+m/rad, with which the controller of arm i pulls its arm towards its reference.
+docs/reference/metrics.md derives each metric.
 
 Invariant:
     - A stiffness is reported only if the action of a single operator is the only change between
@@ -34,7 +34,7 @@ from ..arm_rows import build_arm_rows
 from ..row_reductions import any_in_rows, max_rows
 from ..run_end import STATIC_SPEED_RAD_S
 from ..run_view import RunView, SiteRun
-from .measures import SHARING, Metric, MetricValues, Quantity, measures, metric
+from .measures import SHARING, Metric, MetricValues, Quantity, measures
 
 WINDOW_S = 1.0
 """Length of a static window, in s."""
@@ -199,20 +199,20 @@ def _average_window(
 
 
 class StiffnessEstimate(NamedTuple):
-    """Stiffness that an operator felt at a joint, between two successive static windows.
+    """Stiffness that an operator felt at a joint, between two consecutive static windows.
 
-    All arms rest in a static window. The stiffness is the change of torque over the change of
-    angle, for example of an arm that leans against a wall.
+    All arms are at rest in a static window. The stiffness is the change of torque divided by
+    the change of angle, for example of an arm that leans against a wall.
 
     Attributes:
         from_s: End of the first window, in s.
         to_s: End of the second window, in s.
         site: Site of the operator.
         joint: Number of the joint, from 1.
-        torque_nm: Change of the operator's torque on its arm.
-        angle_rad: Change of the joint's angle.
-        stiffness_nm_rad: Ratio of both changes. `None` if the joint did not move, because the
-            joint is then too stiff to be measured.
+        torque_nm: Change of the operator's torque on the arm, in N m.
+        angle_rad: Change of the joint angle, in rad.
+        stiffness_nm_rad: Ratio of the two changes, in N m/rad. `None` if the joint did not
+            move, in which case it is too stiff to be measured.
     """
 
     from_s: float
@@ -227,8 +227,8 @@ class StiffnessEstimate(NamedTuple):
     def list_of_run(cls, view: RunView) -> "list[StiffnessEstimate]":
         """Estimates how stiff the teleoperator feels to an operator who moved it slowly.
 
-        Two successive static windows are compared, in which all arms rest. The stiffness is the
-        change of the operator's torque over the change of the angle. It is estimated only if a
+        Each estimate compares two consecutive static windows. The stiffness is the change of
+        the operator's torque divided by the change of the angle. It is estimated only if a
         single operator moved between the windows.
 
         Args:
@@ -285,7 +285,7 @@ def _find_single_mover(before: _StaticWindow, after: _StaticWindow) -> str:
 class SharingRatio(NamedTuple):
     """Measured force sharing at a joint: how much of a torque on another arm an operator feels.
 
-    It is measured while all arms rest, at a joint at which exactly two arms are loaded.
+    It is measured while all arms are at rest, at a joint at which exactly two arms are loaded.
 
     Attributes:
         from_s: Time of the window's first tick, in s.
@@ -297,8 +297,8 @@ class SharingRatio(NamedTuple):
         holds: Site of the operator who feels the torque.
         felt_nm: Torque that this operator feels, in N m: the negative of the operator's torque
             on the arm.
-        expected_nm: Torque that the operator should feel according to the dominance factors,
-            the weights with which the sites follow each other, in N m.
+        expected_nm: Torque that the operator should feel according to the dominance factors, in
+            N m.
     """
 
     from_s: float
@@ -326,10 +326,10 @@ class SharingRatio(NamedTuple):
 
     @classmethod
     def list_of_run(cls, view: RunView) -> "list[SharingRatio]":
-        """Compares the torque that an operator feels with the torque that another arm receives.
+        """Compares the torque that an operator feels with the torque on another arm.
 
-        The comparison is made at every joint at which exactly two arms carry a torque, while
-        all arms rest. The operator who feels the torque is the one who holds an arm like a
+        The comparison is made at every joint at which exactly two arms are loaded, while all
+        arms are at rest. The operator who feels the torque is the one who holds an arm like a
         spring. If both operators do so, or neither of them, it is the operator of the master.
         The torque on the other arm is the cause.
 
@@ -337,7 +337,7 @@ class SharingRatio(NamedTuple):
             view: The recorded run.
 
         Returns:
-            The comparisons by time. Empty if there is no joint of this kind.
+            The comparisons in order of time. Empty if there is no such joint.
         """
         static_windows = view.compute_once(_find_static_windows)
         window_by_start = {window.from_s: window for window in static_windows}
@@ -363,7 +363,7 @@ class SharingRatio(NamedTuple):
             elif holds_weight.value == 0.0:
                 expected = Metric(None, f"no site depends on {holds} in the end")
             else:
-                expected = metric(torque * pushed_weight.value / holds_weight.value)
+                expected = Metric.of_value(torque * pushed_weight.value / holds_weight.value)
 
             ratio = SharingRatio(
                 from_s=load.from_s,
@@ -381,18 +381,18 @@ class SharingRatio(NamedTuple):
 
 
 class JointLoad(NamedTuple):
-    """External torques on all arms at one joint, while all arms rest.
+    """External torques on all arms at one joint, while all arms are at rest.
 
-    At rest the weighted sum of these torques should be zero, by the equation of the module's
-    docstring.
+    At rest the weighted sum of these torques should be zero, according to the equation in the
+    docstring of the module.
 
     Attributes:
         from_s: Time of the static window's first tick, in s.
         to_s: Time of the static window's last tick, in s.
         joint: Number of the joint, from 1.
-        torque_nm: Torque on the arm of each loaded site, by name, in N m.
+        torque_nm: Torque on the arm of each loaded site, in N m, keyed by site name.
         weight: Weight pi_i / K_i of each loaded site in the sum, scaled so that the largest
-            weight of all sites is 1. The module's docstring defines pi and K.
+            weight of all sites is 1. The docstring of the module defines pi and K.
         imbalance: |sum of weight times torque| / largest |weight times torque|. 0 if the
             torques obey the equation.
     """
@@ -406,16 +406,16 @@ class JointLoad(NamedTuple):
 
     @classmethod
     def list_of_run(cls, view: RunView) -> "list[JointLoad]":
-        """Finds the joints that carry an external torque while all arms rest, with the torques.
+        """Finds the joints that carry an external torque while all arms are at rest.
 
-        At a joint, an arm counts as loaded if the external torque on it is neither small nor
+        An arm counts as loaded at a joint if the external torque on it is neither small nor
         much smaller than the torque on another arm.
 
         Args:
             view: The recorded run.
 
         Returns:
-            The loads, by window and joint. Joints without a load are left out.
+            The loads, ordered by window and joint. Joints without a load are left out.
         """
         loads = []
         for window in view.compute_once(_find_static_windows):
@@ -435,7 +435,7 @@ class JointLoad(NamedTuple):
 
 
 def count_static_windows(view: RunView) -> Metric:
-    """Counts the intervals of a run in which all arms rest under constant torques.
+    """Counts the intervals of a run in which all arms are at rest under constant torques.
 
     Without such an interval, stiffness and force sharing cannot be measured.
 
@@ -443,14 +443,13 @@ def count_static_windows(view: RunView) -> Metric:
         view: The recorded run.
 
     Returns:
-        The number. If it is zero or unknown, the metric contains the reason instead of a
-        number.
+        The number of intervals, or the reason why it is zero or unknown.
     """
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
     windows = view.compute_once(_find_static_windows)
     reason = "no second in which all sites rest under constant torques"
-    return metric(len(windows) or None, reason)
+    return Metric.of_value(len(windows) or None, reason)
 
 
 @measures(
@@ -474,7 +473,7 @@ def _measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     ratios = view.compute_once(SharingRatio.list_of_run)
     deviations = [ratio.off for ratio in ratios if ratio.off is not None]
     if deviations:
-        return {"sharing_off": metric(max(deviations))}
+        return {"sharing_off": Metric.of_value(max(deviations))}
 
     reasons = [ratio.expected_nm.why for ratio in ratios]
     why = count_static_windows(view).why
@@ -518,8 +517,10 @@ def _weigh_load(
         imbalance_ratio = None
         if largest > 0.0:
             imbalance_ratio = abs(sum(weighted)) / largest
-        imbalance = metric(imbalance_ratio, "no loaded site is followed by other sites")
-        weight_metrics = {site: metric(weight[site]) for site in torque}
+        imbalance = Metric.of_value(
+            imbalance_ratio, "no loaded site is followed by other sites"
+        )
+        weight_metrics = {site: Metric.of_value(weight[site]) for site in torque}
 
     return JointLoad(
         from_s=window.from_s,

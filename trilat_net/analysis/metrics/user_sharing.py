@@ -1,14 +1,14 @@
 """Computes how several users share one slave arm: authority, disagreement and takeovers.
 
 In trilateral teleoperation, for example, two users (a trainer and a trainee) move two master
-arms, and one slave arm follows both. It follows each master with a weight, the dominance factor
-of the user, which may change during the run. The slave is the first one of the scenario.
+arms, and one slave arm follows both. It follows each master with a dominance factor, which may
+change during the run. The slave is the first one of the scenario.
 
 Invariant:
     - The user with the largest dominance factor leads.
     - Only the torques with which the operators push their arms count, not the torques of walls
       and other environments. In task space, forces at the end effectors replace them.
-    - Ticks without a record do not count.
+    - Ticks without a record are ignored.
 """
 
 import math
@@ -26,7 +26,6 @@ from .measures import (
     MetricValues,
     Quantity,
     measures,
-    metric,
     peak,
     rms,
     unavailable,
@@ -118,9 +117,9 @@ def _measure_authority(view: RunView, site: str) -> MetricValues:
     if isinstance(motion_shares, Metric):
         motion_share = motion_shares
     else:
-        motion_share = metric(motion_shares[user])
+        motion_share = Metric.of_value(motion_shares[user])
     return {
-        "authority_effort_nm2_s": metric(float(effort)),
+        "authority_effort_nm2_s": Metric.of_value(float(effort)),
         "motion_share": motion_share,
     }
 
@@ -230,13 +229,13 @@ def _measure_sharing(view: RunView, _run: str) -> MetricValues:
     ]
     longest_s = _not_applicable("the leader never changes")
     if durations_s:
-        longest_s = metric(max(durations_s))
+        longest_s = Metric.of_value(max(durations_s))
 
     user_runs = [view.shared[user] for user in slave.users]
     return {
         **_measure_disagreement(user_runs),
-        "intervention_share": metric(float(intervenes.mean())),
-        "takeovers": metric(float(len(takeover_times_s))),
+        "intervention_share": Metric.of_value(float(intervenes.mean())),
+        "takeovers": Metric.of_value(float(len(takeover_times_s))),
         "takeover_s": longest_s,
         "lead_jump": _compare_steps(records, ramp_spans_s),
     }
@@ -264,7 +263,7 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
 
     internal_share = _not_applicable("no user pushes")
     if total:
-        internal_share = metric(2.0 * cancelled.sum() / total)
+        internal_share = Metric.of_value(2.0 * cancelled.sum() / total)
     values = {"internal_share": internal_share}
     # in task space, forces along the axes of the position come first
     force_columns = POSITION if runs[0].records.x.size else 0
@@ -272,7 +271,7 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     joint_torques = cancelled[:, force_columns:]
     for unit, amounts in {"n": forces, "nm": joint_torques}.items():
         if amounts.shape[1]:
-            values[f"internal_rms_{unit}"] = metric(rms(amounts))
+            values[f"internal_rms_{unit}"] = Metric.of_value(rms(amounts))
         else:
             values[f"internal_rms_{unit}"] = _not_applicable(
                 "the users share no such coordinate"
@@ -344,4 +343,4 @@ def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, floa
     ratio = None
     if largest_otherwise:
         ratio = largest_while_changing / largest_otherwise
-    return metric(ratio, "the reference rests while no share changes")
+    return Metric.of_value(ratio, "the reference rests while no share changes")

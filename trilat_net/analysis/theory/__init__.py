@@ -1,13 +1,13 @@
 """Predicts by linear analysis whether coupled arms are stable, and what their operators feel.
 
 The control loop of all arms, with its delays and sampling, is linearised about a pose in which
-all arms rest. Its characteristic roots tell whether small motions die away. For example, the
-delay margin is the largest network delay for which they do. docs/studies/linear.md and
+all arms are at rest. Its characteristic roots show whether small motions decay. The delay
+margin, for example, is the largest network delay for which they do. docs/studies/linear.md and
 docs/studies/ports.md contain the definitions, equations and literature.
 
 Invariant:
-    - The equations are written a second time in plain NumPy and share nothing with the compiled
-      simulation, so that roots and simulated runs check each other.
+    - The equations are implemented a second time in plain NumPy and share nothing with the
+      compiled simulation. Roots and simulated runs thus verify each other.
     - The simulation only supplies the pose at which a run comes to rest.
 """
 

@@ -1,27 +1,27 @@
 """Computes the characteristic roots of a linear control loop with delays.
 
 A motion v exp(s t) with a constant vector v is possible in the loop if Delta(s) v = 0, where
-Delta(s) is the characteristic matrix of the loop. These numbers s are the roots. The loop is
-stable if all roots have a negative real part. A loop with delays has infinitely many roots;
-this module computes the rightmost ones, in two steps:
+Delta(s) is the characteristic matrix of the loop. The values of s for which such a v exists are
+the roots. The loop is stable if all roots have a negative real part. A loop with delays has
+infinitely many roots; this module computes the rightmost ones, in two steps:
 
-1. Guesses for the continuous loop are eigenvalues of a matrix that approximates the loop
-   together with its stored past (the Chebyshev pseudospectral discretisation of the
-   infinitesimal generator). The order of the approximation doubles until the wanted roots
+1. Initial guesses for the continuous loop are eigenvalues of a matrix that approximates the
+   loop together with its stored past (the Chebyshev pseudospectral discretisation of the
+   infinitesimal generator). The order of the approximation is doubled until the wanted roots
    agree. Breda, Maset and Vermiglio, "Pseudospectral differencing methods for characteristic
-   roots of delay differential equations", SIAM J. Scientific Computing 27 (2005); nodes after
+   roots of delay differential equations", SIAM J. Scientific Computing 27 (2005); nodes from
    Trefethen, "Spectral Methods in MATLAB" (2000).
-2. Newton's method refines each guess by a sequence of linear problems: solve
-   Delta(s) v = mu Delta'(s) v, where Delta' is the derivative of Delta, and subtract the
-   smallest eigenvalue mu from s. The method converges quadratically for simple roots. It also
-   does so for multiple roots that have as many vectors v, as in loops of identical arms. Ruhe,
-   "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
+2. Newton's method refines each guess by a sequence of linear problems: solve Delta(s) v = mu
+   Delta'(s) v, where Delta' is the derivative of Delta, and subtract the smallest eigenvalue mu
+   from s. The method converges quadratically for simple roots, and also for multiple roots that
+   have as many vectors v, as in loops of identical arms. Ruhe, "Algorithms for the nonlinear
+   eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
 
 Invariant:
-    - A root solves the equation up to rounding errors, for every discretisation that supplies
-      its guess.
+    - A root solves the equation up to rounding errors, whichever discretisation supplied its
+      guess.
     - Some roots are zero for every delay, because the equations do not change if all arms are
-      shifted, or if a parameter estimate changes that no motion affects. Such roots are
+      shifted, or if a parameter estimate that affects no motion changes. Such roots are
       counted, and never called the rightmost.
 """
 
@@ -81,14 +81,14 @@ class Pencil(NamedTuple):
 
     The loop is E x' = A x + sum_k A_k x(t - T_k) with the state x. Its characteristic matrix is
     Delta(s) = s E - A - sum_k A_k exp(-s T_k). The characteristic roots s, at which Delta(s) is
-    singular, give the rates and frequencies of the loop's modes.
+    singular, are the rates and frequencies of the loop's modes.
 
     Attributes:
-        A: Matrix of the terms without delay, shape (n, n).
+        A: Matrix of the undelayed terms, shape (n, n).
         delays: Delays T_k, in s, shape (K,).
         Ad: Matrices A_k of the delayed terms, shape (K, n, n).
-        E: Diagonal of E, shape (n,): 1 for a state with a rate, 0 for a state that an algebraic
-            equation determines. `None` if every state has a rate.
+        E: Diagonal of E, shape (n,): 1 for a differential state, 0 for a state determined by an
+            algebraic equation. `None` if every state is differential.
     """
 
     A: Array
@@ -101,8 +101,8 @@ class Pencil(NamedTuple):
         """Matrix E of the loop equation E x' = A x + sum_k A_k x(t - T_k), shape (n, n).
 
         x is the state of all arms, with n entries, and T_k are the network delays. E is
-        diagonal. An entry is 1 if the state has a rate of change, and 0 if an algebraic
-        equation determines the state.
+        diagonal, with 1 for a differential state and 0 for a state determined by an algebraic
+        equation.
         """
         if self.E is None:
             return np.eye(len(self.A))
@@ -111,7 +111,8 @@ class Pencil(NamedTuple):
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
         """Evaluates the characteristic matrix Delta(s) of the control loop and its derivative.
 
-        Delta(s) is singular at a root of the loop. Newton's method needs both to refine a root.
+        Delta(s) is singular at a root of the loop. Newton's method needs both matrices to
+        refine a root.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -130,10 +131,9 @@ class Pencil(NamedTuple):
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def sum_term_norms(self, s: complex) -> float:
-        """Returns the size of the terms in the characteristic matrix Delta(s).
+        """Returns the sum of the norms of the terms in the characteristic matrix Delta(s).
 
-        The size is the sum of the norms of the terms. A residual of Delta(s) counts as zero if
-        it is small compared with this sum.
+        A residual of Delta(s) counts as zero if it is small compared with this sum.
 
         Args:
             s: Complex frequency, in 1/s.
@@ -144,17 +144,16 @@ class Pencil(NamedTuple):
         return float(abs(s) + undelayed + delayed)
 
     def compute_taylor_coefficient(self, power: int) -> Array:
-        """Returns a coefficient of the Taylor series of the characteristic matrix at s = 0.
+        """Returns a coefficient of the Taylor series of the characteristic matrix about s = 0.
 
         The characteristic matrix is Delta(s) = s E - A - sum_k A_k exp(-s T_k), with the
-        matrices E, A and A_k and the delays T_k of the loop. Its n rows and columns belong to
-        the n states.
+        matrices E, A and A_k and the delays T_k of the loop.
 
         Args:
-            power: Power of s to which the coefficient belongs, from 0.
+            power: Power of s to which the coefficient belongs, starting from 0.
 
         Returns:
-            The coefficient, shape (n, n).
+            The coefficient, shape (n, n) for n states.
         """
         undelayed: Array | float = 0.0
         if power == 0:
@@ -169,7 +168,7 @@ class Pencil(NamedTuple):
 
     @property
     def delayed_states(self) -> NDArray[np.intp]:
-        """Indices of the states whose delayed values act on the arms.
+        """Indices of the states that act on the arms with a delay.
 
         For example, an arm follows the angles that another arm had some time ago. Only these
         few states are discretised over the delay, which keeps the matrices small.
@@ -178,9 +177,9 @@ class Pencil(NamedTuple):
         return np.flatnonzero(effects)
 
     def extract_moving_part(self, names: Sequence[str]) -> "MovingPart":
-        """Removes the states of a linear loop that do not change or act on no other state.
+        """Removes states of a linear loop that never change or that act on no other state.
 
-        For example, a parameter estimate may act on no motion. These states do not influence
+        An example is a parameter estimate that affects no motion. These states do not influence
         the other modes of the loop. Each of them only adds a characteristic root at zero.
 
         Args:
@@ -224,19 +223,19 @@ class Pencil(NamedTuple):
         names: Sequence[str],
         wanted: int,
     ) -> "tuple[list[CharacteristicRoot], int]":
-        """Refines guesses of the rightmost roots by Newton's method.
+        """Refines guesses of the rightmost roots with Newton's method.
 
-        Two more roots than wanted are refined, because the method may change their order. The
-        remaining guesses are skipped.
+        Two more roots than wanted are refined, because the refinement may change their order.
+        The remaining guesses are skipped.
 
         Args:
-            candidates: Guesses of nonzero roots, shape (K,), by falling real part.
+            candidates: Guesses of nonzero roots, shape (K,), in descending order of real part.
             names: Names of the states.
             wanted: Number of roots. A conjugate pair counts once.
 
         Returns:
-            The `wanted` rightmost roots, or fewer if the loop does not have so many.
-            The number of guesses from which no root was reached.
+            The `wanted` rightmost roots, or fewer if the loop has fewer.
+            The number of guesses that led to no root.
         """
         roots: list[CharacteristicRoot] = []
         dropped = 0
@@ -273,16 +272,17 @@ states, each of which has a root at zero.
 
 
 class CharacteristicRoot(NamedTuple):
-    """A characteristic root s of the control loop: small motions may change like exp(s t).
+    """A characteristic root s of the control loop: small motions may evolve as exp(s t).
 
-    The motions grow if the real part of s is positive. A complex root comes with its conjugate,
-    which is not listed.
+    The motions grow if the real part of s is positive. The conjugate of a complex root is also
+    a root, but is not listed.
 
     Attributes:
         s: The root with a non-negative imaginary part, in 1/s. Its real part is the growth
             rate.
         multiplicity: Number of modes that share the root.
-        states: Names of the states that participate most, the largest first, such as "m1.q2".
+        states: Names of the states that participate most, such as "m1.q2", in descending order
+            of participation.
     """
 
     s: complex
@@ -291,7 +291,7 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Damping ratio of the motion exp(s t) that belongs to the root, from -1 to 1.
+        """Damping ratio, from -1 to 1, of the motion exp(s t) that belongs to the root.
 
         It is -re(s) / abs(s): 1 for a decay without oscillation, 0 for a lasting oscillation,
         and negative if the motion grows.
@@ -302,16 +302,17 @@ class CharacteristicRoot(NamedTuple):
 class Spectrum(NamedTuple):
     """The rightmost characteristic roots of a loop, which decide its stability.
 
-    Some roots are zero by structure, because all arms can rest in other poses too, or because
-    nothing excites an estimate. Roots that are zero by structure say nothing about stability.
+    Some roots are zero because of the structure of the loop: all arms can also rest in other
+    poses, or nothing excites an estimate. These structural zeros say nothing about stability.
 
     Attributes:
-        roots: The rightmost roots that are not zero by structure, by falling real part.
-        zeros: Number of roots that are zero by structure.
-        drifting: Number of those zeros without an eigenvector of their own. Their modes grow
-            with time.
-        dropped: Number of guesses from which Newton's method reached no root.
-        order: Order of the discretisation that gave the guesses. 0 if none was needed.
+        roots: The rightmost roots other than structural zeros, in descending order of real
+            part.
+        zeros: Number of structural zeros.
+        drifting: Number of structural zeros without an eigenvector of their own. Their modes
+            grow with time.
+        dropped: Number of guesses for which Newton's method reached no root.
+        order: Order of the discretisation that supplied the guesses. 0 if none was needed.
         span_s: Time over which the roots are computed, in s: the period after which delays and
             tick rates repeat, or the analysed span of delays that do not repeat. `None` if all
             ticks are alike.
@@ -334,8 +335,8 @@ class Spectrum(NamedTuple):
         """The characteristic root with the largest real part, which determines stability.
 
         The real part is the growth rate of a small motion. Roots that are zero because of the
-        structure of the loop are not considered: they exist, for example, because all arms can
-        rest in other poses too. `None` if there are no other roots.
+        structure of the loop, for example because all arms can also rest in other poses, are
+        not considered. `None` if there are no other roots.
         """
         return self.roots[0] if self.roots else None
 
@@ -343,9 +344,9 @@ class Spectrum(NamedTuple):
     def verdict(self) -> str:
         """The stability according to the rightmost root: "stable", "unstable" or "at the edge".
 
-        A root closer to the imaginary axis than `STABILITY_EDGE_PER_S`, or than twice its
-        standard deviation for random delays, is at the edge. A loop with a zero root whose
-        motion drifts is at the edge too.
+        A root is at the edge if its distance from the imaginary axis is less than
+        `STABILITY_EDGE_PER_S`, or less than twice its standard deviation in the case of random
+        delays. A loop is also at the edge if it has a zero root whose motion drifts.
         """
         rightmost_per_s = -math.inf
         if self.roots:
@@ -363,8 +364,8 @@ class Spectrum(NamedTuple):
         """Computes the rightmost roots of a loop with delays, in continuous time.
 
         The loop is stable if all roots have a negative real part. The order of the
-        discretisation that supplies the guesses is doubled, until the roots of two orders agree
-        or the matrix is too large.
+        discretisation that supplies the guesses is doubled until the roots of two orders agree
+        or the matrix becomes too large.
 
         Args:
             loop: The loop.
@@ -564,8 +565,8 @@ def _count_zero_roots(pencil: Pencil) -> tuple[int, int]:
 def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Reduces a linear loop to the states that can influence its stability.
 
-    Constant states, and states that act on no other state, are left out. Each of them only adds
-    a characteristic root at zero.
+    States that are constant or act on no other state are left out. Each of them only adds a
+    characteristic root at zero.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -671,14 +672,15 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
 
     # x in [-1, 1] stands for the time from -T_max to 0
     x = 1.0 - 2.0 * pencil.delays / longest_s
-    interpolation = chebyshev_interpolation(order, x)
+    grid = ChebyshevGrid(order)
+    interpolation = grid.build_interpolation(x)
     for weights, Ad in zip(interpolation, pencil.Ad, strict=True):
         delayed_columns = Ad[:, delayed]
         generator[:n, delayed] += weights[0] * delayed_columns
         generator[:n, n:] += np.kron(weights[1:], delayed_columns)
 
     # the history moves along the nodes: its rate is its derivative by time
-    differentiation = chebyshev_differentiation(order)
+    differentiation = grid.build_differentiation()
     transport = differentiation[1:] * (2.0 / longest_s)
     generator[n:, n:] = np.kron(transport[:, 1:], np.eye(c))
     for column, state in enumerate(delayed):
@@ -686,55 +688,51 @@ def _discretise_generator(pencil: Pencil, order: int) -> Array:
     return generator
 
 
-def chebyshev_nodes(order: int) -> Array:
-    """Returns the points in [-1, 1] at which delayed states are evaluated.
+class ChebyshevGrid(NamedTuple):
+    """The points in [-1, 1] at which delayed states are evaluated.
 
-    These Chebyshev nodes are cos(pi k / order) for k = 0, ..., order, from 1 down to -1.
+    These Chebyshev nodes are cos(pi k / order) for k = 0, ..., order, in descending order from
+    1 to -1. A polynomial through the points approximates the delayed motion.
 
-    Args:
-        order: Degree of the polynomial through the points.
-
-    Returns:
-        The nodes, shape (order + 1,).
-    """
-    angles = np.pi * np.arange(order + 1) / order
-    return np.cos(angles)
-
-
-def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix that interpolates a polynomial between the Chebyshev nodes.
-
-    Multiplied by the values at the nodes, it gives the values at the points x.
-
-    Args:
+    Attributes:
         order: Degree of the polynomial.
-        x: Points in [-1, 1], shape (K,).
-
-    Returns:
-        Matrix of shape (K, order + 1).
     """
-    nodes = chebyshev_nodes(order)
-    basis_at_nodes = chebvander(nodes, order)
-    basis_at_x = chebvander(x, order)
-    transposed = np.linalg.solve(basis_at_nodes.T, basis_at_x.T)
-    return transposed.T.astype(np.float64)
 
+    order: int
 
-def chebyshev_differentiation(order: int) -> Array:
-    """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes.
+    @property
+    def nodes(self) -> Array:
+        """The nodes, shape (order + 1,)."""
+        angles = np.pi * np.arange(self.order + 1) / self.order
+        return np.cos(angles)
 
-    Multiplied by the values at the nodes, it gives the derivatives there. Delayed motion is
-    approximated by such a polynomial.
+    def build_interpolation(self, x: Array) -> Array:
+        """Returns the matrix that interpolates a polynomial between the nodes.
 
-    Args:
-        order: Degree of the polynomial.
+        It maps the values at the nodes to the values at the points x.
 
-    Returns:
-        Matrix of shape (order + 1, order + 1).
-    """
-    nodes = chebyshev_nodes(order)
-    basis_at_nodes = chebvander(nodes, order)
-    derivatives = chebder(np.eye(order + 1))
-    slopes = chebvander(nodes, order - 1) @ derivatives
-    transposed = np.linalg.solve(basis_at_nodes.T, slopes.T)
-    return transposed.T.astype(np.float64)
+        Args:
+            x: Points in [-1, 1], shape (K,).
+
+        Returns:
+            Matrix of shape (K, order + 1).
+        """
+        basis_at_nodes = chebvander(self.nodes, self.order)
+        basis_at_x = chebvander(x, self.order)
+        transposed = np.linalg.solve(basis_at_nodes.T, basis_at_x.T)
+        return transposed.T.astype(np.float64)
+
+    def build_differentiation(self) -> Array:
+        """Returns the matrix that differentiates a polynomial given at the nodes.
+
+        It maps the values at the nodes to the derivatives there.
+
+        Returns:
+            Matrix of shape (order + 1, order + 1).
+        """
+        nodes = self.nodes
+        basis_at_nodes = chebvander(nodes, self.order)
+        derivatives = chebder(np.eye(self.order + 1))
+        slopes = chebvander(nodes, self.order - 1) @ derivatives
+        transposed = np.linalg.solve(basis_at_nodes.T, slopes.T)
+        return transposed.T.astype(np.float64)

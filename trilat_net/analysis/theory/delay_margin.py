@@ -1,17 +1,17 @@
-"""Computes for which network delays the control loop is stable, and thus its delay margin.
+"""Computes the delay margin: the network delays for which the control loop is stable.
 
 The linearised control loop is x' = A x + A_d x(t - T), with the state x, constant matrices A
-and A_d, and the same delay T on all links. Only some components of x act after the delay. A
-characteristic root of the loop lies on the imaginary axis at j w, where j is the imaginary
-unit and w an angular frequency, if
+and A_d, and the same delay T on all links. Only some components of x act with a delay. A
+characteristic root of the loop lies on the imaginary axis at j w, where j is the imaginary unit
+and w an angular frequency, if
 
     det(I - exp(-j w T) G(j w)) = 0.
 
 G(j w) consists of those rows of (j w I - A)^-1 A_d that belong to the delayed components. Such
-a root exists if and only if G(j w) has an eigenvalue of modulus 1 whose phase is w T modulo
-2 pi. If T increases, a pair of roots moves into the unstable half plane if the modulus of this
-eigenvalue falls with w, and out of it if the modulus rises. The crossings are counted upwards
-from a small delay, which gives the number of unstable roots for every delay.
+a root exists if and only if G(j w) has an eigenvalue of modulus 1 whose phase is w T modulo 2
+pi. As T increases, a pair of roots moves into the unstable half plane if the modulus of this
+eigenvalue falls with w, and out of it if the modulus rises. Starting from a small delay, the
+crossings are counted, which gives the number of unstable roots for every delay.
 
 Sources:
     - Chen, Gu and Nett, "A new method for computing delay margins for stability of linear delay
@@ -20,8 +20,8 @@ Sources:
       Ekvacioj 29 (1986).
 
 Invariant:
-    - Crossings of the imaginary axis are sought over frequency and not over delay, so that no
-      crossing is missed between two delays.
+    - Crossings of the imaginary axis are searched for over frequency, not over delay. No
+      crossing between two delays can therefore be missed.
 """
 
 import math
@@ -35,7 +35,7 @@ from ...core import Array
 from ...errors import count_nouns
 from ..blas_threads import limit_blas_threads
 from . import characteristic_roots
-from .linear_loop import DelayedTerm, LinearLoop
+from .linear_loop import LinearLoop
 
 MAX_COMMON_DELAY_S = 10.0
 """Longest common delay that is examined, in s."""
@@ -96,7 +96,7 @@ class _DelayInterval(NamedTuple):
 
         It names the ends of the interval of stable delays, and the frequency at which
         characteristic roots cross the imaginary axis at the upper end. It is empty if no roots
-        cross at either end, because then all examined delays are stable.
+        cross at either end, because all examined delays are then stable.
         """
         if self.low is None and self.high is None:
             return ""
@@ -117,10 +117,10 @@ class DelayMargin(NamedTuple):
     become unstable if roots cross to the right, and may become stable if they return.
 
     Attributes:
-        intervals: Intervals of stable delays, by rising delay. Empty if the loop is unstable
+        intervals: Intervals of stable delays, in ascending order. Empty if the loop is unstable
             for every delay.
-        crossings: All crossings of the imaginary axis for delays up to `MAX_COMMON_DELAY_S`, by
-            rising delay.
+        crossings: All crossings of the imaginary axis for delays up to `MAX_COMMON_DELAY_S`, in
+            ascending order of delay.
         lossless: True if the links carry waves without losses. Some roots are then on the
             imaginary axis for every delay.
     """
@@ -131,7 +131,7 @@ class DelayMargin(NamedTuple):
 
     @property
     def description(self) -> str:
-        """A phrase for the user that states for which network delays the arms are stable.
+        """A phrase for the user on the network delays for which the arms are stable.
 
         The delay is assumed to be the same on all links between the arms.
         """
@@ -157,16 +157,16 @@ class DelayMargin(NamedTuple):
     def of_loop(cls, loop: LinearLoop) -> "DelayMargin":
         """Finds the network delays, equal on all links, for which a control loop is stable.
 
-        The delays that the loop itself contains are replaced by this common delay. The unstable
-        characteristic roots are counted for a small delay, below the first delay at which roots
-        cross the imaginary axis. For larger delays, every crossing changes the count by the
-        number of roots that cross.
+        The common delay replaces the delays of the loop itself. The unstable characteristic
+        roots are counted for a small delay, below the first delay at which roots cross the
+        imaginary axis. For larger delays, every crossing changes the count by the number of
+        roots that cross.
 
         Args:
             loop: Linear model of the coupled arms.
 
         Returns:
-            The intervals of stable delays, and the crossings that limit them.
+            The intervals of stable delays, and the crossings that bound them.
         """
         crossings, lossless = _find_axis_crossings(loop)
         if lossless:
@@ -175,7 +175,7 @@ class DelayMargin(NamedTuple):
         delays_s = [crossing.delay_s for crossing in crossings]
         first_s = min(delays_s, default=0.2)
         start_s = 0.5 * min(first_s, 0.2)
-        start_loop = set_common_delay(loop, start_s)
+        start_loop = loop.set_common_delay(start_s)
         unstable_roots = _count_unstable_roots(start_loop)
 
         # Walk through the crossings. Each one may end or begin a stable interval.
@@ -199,27 +199,6 @@ class DelayMargin(NamedTuple):
             last_interval = _DelayInterval(low_s, MAX_COMMON_DELAY_S, low, None)
             intervals.append(last_interval)
         return cls(tuple(intervals), tuple(crossings))
-
-
-def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
-    """Returns a linear loop with one delay on all network links, for example to check a margin.
-
-    Args:
-        loop: The loop.
-        delay_s: The delay, in s. With 0 the loop has no delayed terms.
-    """
-    if not loop.delayed:
-        return loop
-    state_matrices = [term.A for term in loop.delayed]
-    input_matrices = [term.B for term in loop.delayed]
-    delayed_A = np.sum(state_matrices, axis=0)
-    delayed_B = np.sum(input_matrices, axis=0)
-    if delay_s == 0.0:
-        A = loop.A + delayed_A
-        B = loop.B + delayed_B
-        return loop._replace(A=A, B=B, delayed=())
-    term = DelayedTerm(delay_s, delayed_A, delayed_B)
-    return loop._replace(delayed=(term,))
 
 
 def _count_unstable_roots(loop: LinearLoop) -> int:
@@ -257,7 +236,7 @@ def _find_axis_crossings(loop: LinearLoop) -> tuple[list[_AxisCrossing], bool]:
         True if the loop is lossless: its open-loop response G has an eigenvalue of modulus 1 at
         every frequency. Roots are then on the axis for every delay, and there are no crossings.
     """
-    common_loop = set_common_delay(loop, 1.0)
+    common_loop = loop.set_common_delay(1.0)
     pencil, *_ = characteristic_roots.find_moving_part(common_loop)
     if not len(pencil.delays):
         return [], False
@@ -341,13 +320,13 @@ class _FrequencySweep:
         self._modes: characteristic_roots.Complex = modes.astype(np.complex128)
 
     def build_grid(self) -> Array:
-        """Returns the frequencies to evaluate, ascending, in rad/s.
+        """Returns the frequencies to evaluate, in ascending order, in rad/s.
 
         The frequencies are evenly spaced on a logarithmic scale. Near the frequency of each
-        oscillating mode there are 13 more points, within three times the decay rate of the
+        oscillating mode, 13 more points are added within three times the decay rate of the
         mode, because sharp resonances would fall between the evenly spaced points. If a mode
-        does not decay, the response is infinite at its frequency, and the points lie on both
-        sides of this frequency.
+        does not decay, the response is infinite at its frequency, and the points are placed on
+        either side of it.
         """
         lowest = _LOWEST * self._highest
         even = np.geomspace(lowest, self._highest, _POINTS)
@@ -374,7 +353,8 @@ class _FrequencySweep:
     def compute_eigenvalues(self, omega: Array) -> characteristic_roots.Complex:
         """Computes the eigenvalues of the open-loop frequency response G(j w).
 
-        The loop becomes unstable at a delay where an eigenvalue, turned by the delay, is 1.
+        The loop becomes unstable at a delay for which an eigenvalue, rotated by the delay,
+        equals 1.
 
         Args:
             omega: Frequencies w, shape (K,), in rad/s.
@@ -393,8 +373,8 @@ class _FrequencySweep:
     def count_outside(self, omega: Array) -> NDArray[np.int64]:
         """Counts the eigenvalues of the open-loop frequency response outside the unit circle.
 
-        G(j w) is the open-loop frequency response: the response of the states that act after a
-        delay to their own delayed values, without the delay itself.
+        G(j w) is the open-loop frequency response: the response of the states that act with a
+        delay to their own delayed values, excluding the delay itself.
 
         Args:
             omega: Frequencies w, shape (K,), in rad/s.
@@ -410,14 +390,14 @@ class _FrequencySweep:
     def find_crossings(self, low: float, high: float) -> list[_AxisCrossing]:
         """Finds where eigenvalues of the open-loop frequency response cross the unit circle.
 
-        At the frequency w of a crossing, an eigenvalue of the response G(j w) has the modulus
-        1. A delay can then put a characteristic root of the loop on the imaginary axis, at j w.
+        At the frequency w of a crossing, an eigenvalue of the response G(j w) has modulus one.
+        A delay can then place a characteristic root of the loop on the imaginary axis, at j w.
         Crossings are located by bisection, because the number of eigenvalues outside the circle
         changes there.
 
         Args:
-            low: Lower end of the searched frequencies, in rad/s.
-            high: Upper end of the searched frequencies, in rad/s.
+            low: Lower end of the frequency range, in rad/s.
+            high: Upper end of the frequency range, in rad/s.
 
         Returns:
             The crossings of the imaginary axis by roots, for all delays that cause them. Empty

@@ -1,11 +1,11 @@
 """Finds a pose in which all coupled arms and their parameter estimates are at rest.
 
 The linear stability analysis describes small motions about such a pose, an equilibrium. There
-may be infinitely many equilibria, because any pose on which all arms agree may be an
-equilibrium. Therefore `find_equilibrium` computes the equilibrium nearest to a given pose, for
-example to the last pose of a run. `predict_equilibrium` computes the equilibrium that the arms
-reach from their start poses according to their linear model. A simulated run may supply a pose
-to start from, but the equilibrium itself is found by solving the equations.
+may be infinitely many equilibria, because any pose on which all arms agree may be one.
+`find_equilibrium` therefore computes the equilibrium nearest to a given pose, for example to
+the final pose of a run. `predict_equilibrium` computes the equilibrium that the arms reach from
+their start poses according to their linear model. A simulated run may supply an initial pose,
+but the equilibrium itself is found by solving the equations.
 
 Invariant:
     - The result solves the equations to 1e-10, or a note states that it does not.
@@ -21,7 +21,6 @@ import numpy as np
 from ...core import BUCKETS_PER_S, Array, Law, SiteSetup
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution import FusedRun
-from ...own_code import ImportedLaw
 from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
@@ -63,14 +62,14 @@ A step along its direction leads to other equilibria.
 
 
 def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
-    """Returns the same experiment with a longer duration, so that it can come to rest.
+    """Returns the same scenario with a longer duration, in which the arms can come to rest.
 
     Nothing new begins in the additional time. Operators and environments that act at the
-    original end keep acting. Chirps and multisines are removed, because they never come to
+    original end continue to act. Chirps and multisines are removed, because they never come to
     rest.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: The scenario.
         duration_s: The longer duration, in s.
     """
     end_s = scenario.duration_s
@@ -78,8 +77,8 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     def extend_actors(actors: tuple[Any, ...]) -> tuple[Any, ...]:
         """Adapts operators and walls to a longer run in which the arms are to come to rest.
 
-        Operators that never rest are left out, and springs that act at the original end act
-        until the new end.
+        Operators that never come to rest are removed, and springs that act at the original end
+        act until the new end.
         """
         extended = []
         for actor in actors:
@@ -109,7 +108,7 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
 
 
 def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
-    """Computes how far a pose is from an equilibrium: the rates of the loop's states.
+    """Computes how far a pose is from an equilibrium: the rates of change of the loop's states.
 
     All rates are zero at an equilibrium. The rates of the angles are zero by definition,
     because all arms are at rest. The other rates are the accelerations and the rates of the
@@ -120,7 +119,7 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
         rest: The pose, with parameter estimates.
 
     Returns:
-        Rates, shape (states,).
+        Rates, one per state, shape (states,).
     """
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     states = []
@@ -255,7 +254,7 @@ def _shift_equilibrium(
 def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
     """Returns vectors of different lengths as the rows of one array, padded with zeros.
 
-    Arms with different numbers of joints can then share an array. For example, (1, 2) and (3,)
+    This lets arms with different numbers of joints share an array. For example, (1, 2) and (3,)
     give [[1, 2], [3, 0]].
 
     Args:
@@ -391,15 +390,15 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
-    """Finds a pose in which all arms of a scenario rest, as a base for linear analysis.
+    """Finds a pose in which all arms of a scenario are at rest, as a basis for linear analysis.
 
-    The result is the pose nearest to the end of a run, or a pose that the user gives.
+    The result is the pose nearest to the end of a run, or a pose that the user supplies.
 
     Args:
-        scenario: Description of the experiment.
-        pose: Pose in which all arms rest: an angle per joint in rad, or in task space the pose
-            of the end effectors. The estimates of the arm parameters are then assumed to be
-            true. If `None`, the equilibrium at the end of a run is used.
+        scenario: The scenario.
+        pose: Pose in which all arms are at rest: one angle per joint in rad, or in task space
+            the pose of the end effectors. The estimates of the arm parameters are then assumed
+            to be true. If `None`, the equilibrium at the end of a run is used.
 
     Returns:
         The equilibrium, with remarks for the user.
@@ -407,7 +406,7 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
     Raises:
         ScenarioError: The scenario cannot be linearised, or has no equilibrium near the end of
             its run.
-        UsageError: The pose does not consist of as many finite numbers as expected.
+        UsageError: The pose does not have the expected number of finite values.
     """
     conditions = OperatingConditions.derive(scenario)
     if pose is None:
@@ -418,9 +417,9 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
 
 
 def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Adds remarks about effects that a linear model at the pose of rest misses.
+    """Adds remarks about effects that a linear model at the equilibrium misses.
 
-    Examples are torques at their limits and walls that are just touched.
+    Examples are torques at their limits and walls that are barely touched.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -430,12 +429,12 @@ def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equil
 
 
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Predicts where the arms come to rest, by linear analysis without simulating the motion.
+    """Predicts where the arms come to rest by linear analysis, without simulating the motion.
 
     The arms begin in the start poses of the scenario.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: The scenario.
 
     Raises:
         ScenarioError: The scenario has no linear loop, or no equilibrium near the prediction.
@@ -447,13 +446,13 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """Finds the equilibrium of a scenario that is nearest to a known equilibrium.
 
-    The known equilibrium belongs to a similar scenario, so that an equilibrium can be followed
-    while a setting, such as a gain, changes in small steps. If the known equilibrium is also an
-    equilibrium of this scenario, it is returned, and only missing parameter estimates are
-    added.
+    The known equilibrium belongs to a similar scenario. This makes it possible to follow an
+    equilibrium while a setting, such as a gain, changes in small steps. If the known
+    equilibrium is also an equilibrium of this scenario, it is returned, with any missing
+    parameter estimates added.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
         rest: Equilibrium of the similar scenario.
 
     Raises:
@@ -471,18 +470,15 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Finds the pose in which the arms of a scenario come to rest, by a suitable method.
+    """Finds the pose in which the arms of a scenario come to rest, using a suitable method.
 
     If no control law estimates parameters, and no operator or environment acts, the arms can
-    rest in any pose on which they agree. Then a linear model of the coupled arms predicts which
-    of these poses they reach from their start poses. Otherwise a run is simulated, and the
-    equilibrium at its end is found.
+    rest in any pose on which they agree. In that case, a linear model of the coupled arms
+    predicts which of these poses they reach from their start poses. Otherwise a run is
+    simulated, and the equilibrium at its end is found.
 
     Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        The equilibrium.
+        scenario: The scenario.
 
     Raises:
         ScenarioError: The scenario cannot be linearised, or no equilibrium was found.
@@ -542,9 +538,9 @@ def _iterate_memories(
 def settle_memories(conditions: OperatingConditions, state: Equilibrium) -> Equilibrium:
     """Returns a state in which the memories of imported laws are consistent with its pose.
 
-    The memory of an imported law, a law that a user wrote, takes the position of its estimate.
-    The memory starts with its initial values, and the law is called in the pose of the state
-    until the memory is constant. The estimates of other laws stay unchanged.
+    The memory of an imported law (a law written by a user) is stored in place of its estimate.
+    It starts with its initial value, and the law is called in the pose of the state until the
+    memory is constant. The estimates of other laws remain unchanged.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -642,10 +638,10 @@ def _reach_pose(site: SiteSetup, pose: Array) -> Array:
 def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
     """Returns the mean of the start poses of all arms, shape (m,).
 
-    A pose consists of the joint angles, or in task space of the pose of the end effector (tip).
+    A pose consists of the joint angles, or in task space of the pose of the end effector.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: The scenario.
     """
     conditions = OperatingConditions.derive(scenario)
     count = len(conditions.sites)
@@ -697,12 +693,12 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
             "the equilibrium nearest to the mean of its last quarter"
         )
 
-    laws = scenario.controls
-    if any(isinstance(law, ImportedLaw) for law in laws):
+    user_laws = scenario.user_laws
+    if user_laws:
         # the memory of an imported law takes the position of its estimate
         rows = []
-        for law, estimate, memory in zip(laws, theta_hat, run.memories, strict=True):
-            rows.append(memory if isinstance(law, ImportedLaw) else estimate)
+        for site, estimate, memory in zip(scenario.names, theta_hat, run.memories, strict=True):
+            rows.append(memory if site in user_laws else estimate)
         theta_hat = pad_rows(rows)
 
     estimates = _complete_estimates(conditions, theta_hat)

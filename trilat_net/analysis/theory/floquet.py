@@ -1,9 +1,9 @@
-"""Computes the stability of coupled arms whose controllers compute once per tick.
+"""Computes the stability of coupled arms whose controllers act once per tick.
 
-A site is a process that runs one arm. Its controller computes once per tick, while the arm
-moves continuously. In each tick the site sends a sample, its state, to the other sites. Tick
-rates and delays may differ between sites, but the whole pattern repeats after a period T. Such
-a periodic system is analysed by Floquet theory. Each site is linearised over one tick:
+The controller of a site acts once per tick, while the arm moves continuously. At each tick the
+site sends a sample to the other sites. Tick rates and delays may differ between sites, but the
+whole pattern repeats after a period T. Such a periodic system is analysed by Floquet theory.
+Each site is linearised over one tick:
 
     X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m_ij(k)]
 
@@ -16,15 +16,15 @@ Eigenvalue Problems", second edition (2011), chapter 6).
 
 The integration scheme of the scenario defines how a controller updates its parameter estimates
 and which torque it applies. Let f_k be the rate of the estimates at tick k, tau_k the computed
-torque, and h the tick. Both schemes store a number eta with eta_{k+1} = eta_k + h f_k:
+torque, and h the tick period. Both schemes store a variable eta with eta_{k+1} = eta_k + h f_k:
 
 - The scheme `digital` uses the estimate eta_k and applies tau_k.
-- The scheme `second_order` uses the estimate eta_k + h/2 f_k and applies
-  1.5 tau_k - 0.5 tau_{k-1}.
+- The scheme `second_order` uses the estimate eta_k + h/2 f_k and applies 1.5 tau_k - 0.5
+  tau_{k-1}.
 
 The law `sync` uses the estimate eta_k + h/2 f_k in either scheme.
 
-A control law that a user wrote may have a memory, the values m_k that it stores at tick k. The
+A control law written by a user may have a memory, the values m_k that it stores at tick k. The
 memory takes the place of eta, with the rate f_k = (m_k - m_{k-1}) / h.
 
 Invariant:
@@ -48,9 +48,9 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ...core import Array, IntArray, Law, Scheme, SiteSetup
-from ...scenario import LinkBase, draw_used_samples
+from ...scenario import LinkBase
 from ..blas_threads import limit_blas_threads
-from ..delay_period import MAX_NEAR_PERIOD_S, find_delay_period
+from ..delay_period import MAX_NEAR_PERIOD_S, DelayPeriod
 from .characteristic_roots import (
     NAMED_SHARE,
     ZERO_SHARE,
@@ -66,12 +66,11 @@ from .tick_recurrence import add_matrix_products
 
 
 def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
-    """Returns the matrices Phi and Gamma of x' = A x + B u over a period in which u is held.
+    """Returns the matrices Phi and Gamma of x' = A x + B u over a period with constant u.
 
-    The state after the period is Phi x + Gamma u, with Phi = exp(A h) and
-    Gamma = int_0^h exp(A s) ds B. Both are computed as one matrix exponential: Van Loan,
-    "Computing integrals involving the matrix exponential", IEEE Trans. Automatic Control 23
-    (1978).
+    The state after the period is Phi x + Gamma u, with Phi = exp(A h) and Gamma = int_0^h exp(A
+    s) ds B. Both are computed from one matrix exponential: Van Loan, "Computing integrals
+    involving the matrix exponential", IEEE Trans. Automatic Control 23 (1978).
 
     Args:
         A: Matrix of the states, shape (n, n).
@@ -145,17 +144,17 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
     def compute_control(arguments: Array) -> Array:
         """Returns the contribution of the controller to the state of a site during one tick.
 
-        The torque of the controller moves the arm, and its parameter estimates change. The
-        torque of this tick is kept for the next tick if the integration scheme needs it. All
-        quantities are linear.
+        The controller torque moves the arm, and the parameter estimates change. The torque of
+        this tick is kept for the next tick if the integration scheme needs it. All quantities
+        are linear.
 
         Args:
             arguments: States and inputs of the site, in the order of `ArgumentLayout`, shape
                 (arguments, columns).
 
         Returns:
-            The contribution to the state at the next tick, shape (n, columns), with the n
-            states of the site.
+            The contribution to the state at the next tick, shape (n, columns) for n site
+            states.
         """
         f = rates.estimate @ arguments
         correction: Array | float = 0.0
@@ -213,13 +212,13 @@ def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
 
 
 class CoupledTicks(NamedTuple):
-    """Linear model of all arms and their control loops over one tick, a period of the loops.
+    """Linear model of all arms and their control loops over one tick.
 
-    The eigenvalues of the model show whether small motions grow. The n states belong to sites,
-    the processes that each run one arm.
+    The eigenvalues of the model show whether small motions grow. The n states belong to the
+    sites.
 
     Attributes:
-        S: Matrix that maps the states of all sites to their next tick, without the effects of
+        S: Matrix that maps the states of all sites to their next tick, excluding the effects of
             sites on each other, shape (n, n). It is block diagonal.
         effects: For each pair (i, j), the effect of the states of site j on the states of site
             i, shape (n, n). Pairs without an effect are missing.
@@ -238,16 +237,13 @@ class CoupledTicks(NamedTuple):
     def of_conditions(
         cls, conditions: OperatingConditions, rest: Equilibrium
     ) -> "CoupledTicks":
-        """Builds the linear model of all coupled arms over one tick, a period of control loops.
+        """Builds the linear model of all coupled arms over one tick.
 
-        States that are constant, and states without an effect, are left out.
+        States that are constant or have no effect are left out.
 
         Args:
-            conditions: The sites (processes that each run one arm), gains and delays.
-            rest: The pose of rest about which the sites are linearised.
-
-        Returns:
-            The model, with the number of omitted states.
+            conditions: The sites, gains and delays.
+            rest: The equilibrium about which the sites are linearised.
         """
         jacobians = SiteJacobian.list_of_sites(conditions, rest)
         maps = []
@@ -311,18 +307,17 @@ _SAME_ROOT = 1e-6
 
 
 class SamplesInUse(NamedTuple):
-    """The messages that every arm uses from each other arm, in every tick of a span of time.
+    """The samples that every arm uses from each other arm, at every tick of a time span.
 
-    A tick is one period of a control loop. A sample is the message with an arm's state in one
-    tick. At the beginning of the span, the ticks of all arms coincide.
+    At the beginning of the span, the ticks of all arms coincide.
 
     Attributes:
         span_s: Length of the span, in s.
-        used: For each pair (i, j), the numbers of the samples of site j that site i uses, with
-            an entry for each tick of site i. The sample that site j sends at the beginning of
-            the span has the number 0.
-        period_s: Time after which the pattern of ticks and delays repeats, in s. The span
-            contains it a whole number of times. `None` if the pattern does not repeat.
+        used: For each pair (i, j), the numbers of the samples of site j that site i uses, one
+            per tick of site i. The sample that site j sends at the beginning of the span has
+            the number 0.
+        period_s: Time after which the pattern of ticks and delays repeats, in s, or `None` if
+            it does not repeat. The span is an integer multiple of this period.
         is_exact: True if the pattern repeats exactly, False if it repeats to within half a tick
             or not at all.
     """
@@ -334,11 +329,10 @@ class SamplesInUse(NamedTuple):
 
     @classmethod
     def predict(cls, conditions: OperatingConditions) -> "SamplesInUse":
-        """Finds which samples of the other sites each site uses, in every tick of a span.
+        """Finds which samples of the other sites each site uses, at every tick of a time span.
 
-        A sample is the state that a site sends in one tick (period of its control loop). The
-        pattern of used samples repeats after some time, and the span consists of whole
-        repetitions. Random delays never repeat. A span of fixed length with drawn delays is
+        The pattern of used samples repeats after some time, and the span consists of complete
+        repetitions. Random delays never repeat, and a span of fixed length with drawn delays is
         used for them.
 
         Args:
@@ -352,7 +346,7 @@ class SamplesInUse(NamedTuple):
         links: list[LinkBase] = []
         if conditions.varying:
             links = [link for link, _ in conditions.links.values()]
-        period = find_delay_period(links, rates_hz)
+        period = DelayPeriod.of_links(links, rates_hz)
         period_s = period.span_s
         delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
         reach_ms = max(delays_ms, default=0.0)
@@ -376,7 +370,7 @@ class SamplesInUse(NamedTuple):
             ticks = np.arange(round(span_s * hz))
             if conditions.varying:
                 link, key = conditions.links[i, j]
-                drawn = draw_used_samples(link, key, hz, peer_hz, start_s + span_s)
+                drawn = link.draw_used_samples(key, hz, peer_hz, start_s + span_s)
                 first_tick = round(start_s * hz)
                 first_sample = round(start_s * peer_hz)
                 samples = drawn[first_tick + ticks]
@@ -587,13 +581,13 @@ class _SpanMap:
         return np.linalg.qr(columns)[0]
 
     def build_constant_columns(self, X: Array) -> Array:
-        """Returns columns of states for motions in which nothing has changed in the past.
+        """Returns columns of states for motions that have been constant in the past.
 
         Each column contains the values that all arms sent at their last ticks, as far back as
         they are used, and the states of all arms.
 
         Args:
-            X: The constant states, shape (n, columns), with the n states of all sites.
+            X: The constant states, shape (n, columns) for n states of all sites.
 
         Returns:
             The columns, shape (size, columns).
@@ -608,7 +602,7 @@ class _SpanMap:
     def divide_out_constant(self, V: Array) -> Array:
         """Removes motions that never change, such as a constant offset, from columns of states.
 
-        Their multipliers are exactly 1. After their removal, the search finds the other roots.
+        Their multipliers are exactly 1. Removing them lets the search find the other roots.
 
         Args:
             V: Columns, shape (size, columns).
@@ -670,7 +664,7 @@ class _SpanMap:
         divided: bool = True,
         sizes: list[Array] | None = None,
     ) -> tuple[Array, list[Array]]:
-        """Computes how small motions of the arms develop over the analysed span of time.
+        """Computes how small motions of the arms develop over the analysed time span.
 
         Motions that grow over one span grow without limit, because the spans repeat.
 
@@ -682,8 +676,8 @@ class _SpanMap:
 
         Returns:
             The motions at the end of the span, shape (size, columns).
-            For each site i, its n_i states at the start of the span and at every tick after it,
-            shape (ticks + 1, n_i, columns).
+            For each site i, its n_i states at the start of the span and at every subsequent
+            tick, shape (ticks + 1, n_i, columns).
         """
         tracks = self._build_tracks(V)
         for n, part in enumerate(self._parts):
@@ -832,19 +826,19 @@ def compute_sampled_spectrum(
 ) -> Spectrum | None:
     """Computes the rightmost characteristic roots of coupled arms with sampled controllers.
 
-    A tick is one period of the control loop. A small motion is followed over a span of T
-    seconds, after which the pattern of delays and ticks repeats. This gives a linear map of the
-    states. Each eigenvalue z of the map corresponds to a root s with z = exp(s T).
+    A small motion is followed over a span of T seconds, after which the pattern of delays and
+    ticks repeats. This gives a linear map of the states. Each eigenvalue z of the map
+    corresponds to a root s with z = exp(s T).
 
     Args:
-        conditions: The sites (processes that each run one arm), gains and delays.
-        rest: The pose of rest about which the loop is linearised.
-        wanted: Number of roots. Fewer result if the others are too close to -infinity.
+        conditions: The sites, gains and delays.
+        rest: The equilibrium about which the loop is linearised.
+        wanted: Number of roots. Fewer are returned if the others are too close to -infinity.
         uses: The samples of the other sites that each site uses. If `None`, they are derived
             from the links.
 
     Returns:
-        The roots. `None` if a control law can be linearised in continuous time only.
+        The roots, or `None` if a control law can only be linearised in continuous time.
     """
     if conditions.has_forms:
         return None
@@ -852,14 +846,14 @@ def compute_sampled_spectrum(
 
 
 class SampledLoop:
-    """Linear model of coupled arms whose controllers act in ticks, for several poses of rest.
+    """Linear model of coupled arms whose controllers act in ticks, for several equilibria.
 
-    The modes about a first pose are a good start for the search for the modes about a second
-    pose nearby, which then takes half of the time.
+    The modes about one equilibrium are a good starting point for the search for the modes about
+    another one nearby, which then takes half the time.
 
     Args:
-        conditions: The sites (processes that each run one arm), gains and delays. All control
-            laws can be linearised in ticks.
+        conditions: The sites, gains and delays. All control laws must permit linearisation in
+            ticks.
         uses: The samples of the other sites that each site uses. If `None`, they are derived
             from the links.
     """
@@ -875,13 +869,13 @@ class SampledLoop:
 
     @limit_blas_threads()
     def compute_spectrum(self, rest: Equilibrium, wanted: int) -> Spectrum:
-        """Computes the fastest growing (rightmost) roots of small motions about a pose of rest.
+        """Computes the fastest growing (rightmost) roots of small motions about an equilibrium.
 
-        The control loops with their ticks and delays are linearised, see
-        `compute_sampled_spectrum`.
+        The control loops are linearised including their ticks and delays (see
+        `compute_sampled_spectrum`).
 
         Args:
-            rest: The pose of rest.
+            rest: The equilibrium.
             wanted: Number of roots.
         """
         uses = self._uses
@@ -945,8 +939,8 @@ class SampledLoop:
                 thousandth of this rate.
 
         Returns:
-            The real part of the rightmost root, in 1/s. `None` if all roots are zero by
-            structure.
+            The real part of the rightmost root, in 1/s, or `None` if all roots are zero because
+            of the structure of the loop.
         """
         loop = CoupledTicks.of_conditions(self._conditions, pose)
         if not loop.names:

@@ -1,13 +1,13 @@
 """Finds minima of curves over frequency, and the bands in which a curve is below a level.
 
-The curves, such as eigenvalues of a frequency response, can be evaluated only at discrete
-frequencies, and a coarse grid would miss narrow minima. Therefore the grid is refined where the
-response changes by more than a tenth between two points, and around minima until the neighbours
-of each minimum lie less than 1 % above it.
+The curves, such as eigenvalues of a frequency response, can only be evaluated at discrete
+frequencies, and a coarse grid would miss narrow minima. The grid is therefore refined where the
+response changes by more than a tenth between two points, and around each minimum until its
+neighbours are less than 1 % higher.
 
 Invariant:
-    - Values on a grid are evidence but not a proof: features that are narrower than the steps
-      of the grid stay hidden.
+    - Values on a grid are evidence, not a proof: features narrower than the grid spacing remain
+      hidden.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ _SETTLED = 0.01
 """A minimum is resolved if its neighbours lie above it by at most this share of its depth."""
 
 
-class FrequencyBand(NamedTuple):
+class _FrequencyBand(NamedTuple):
     """A range of frequencies, in Hz, for example the range in which a system is not passive."""
 
     from_hz: float
@@ -52,9 +52,9 @@ class FrequencyBand(NamedTuple):
 
 
 class Minima(NamedTuple):
-    """A curve over frequency, sampled so finely that its minima are resolved.
+    """A curve over frequency, sampled finely enough to resolve its minima.
 
-    An example is the least eigenvalue of a frequency response, whose negative bands matter.
+    An example is the smallest eigenvalue of a frequency response, whose negative bands matter.
 
     Attributes:
         w_rad_s: Frequencies, shape (F,), in rad/s.
@@ -64,13 +64,13 @@ class Minima(NamedTuple):
 
     w_rad_s: Array
     values: Array
-    below: tuple[FrequencyBand, ...]
+    below: tuple[_FrequencyBand, ...]
 
     @property
     def least(self) -> float:
         """Lowest value of the curve over all frequencies.
 
-        If the curve must be positive, such as an eigenvalue, this is the margin. A negative
+        For a curve that must be positive, such as an eigenvalue, this is the margin. A negative
         value is a violation.
         """
         return float(self.values.min())
@@ -90,14 +90,14 @@ class Minima(NamedTuple):
         level: float = 0.0,
         tolerance: FrequencyCurve | None = None,
     ) -> "Minima":
-        """Evaluates a curve over frequency, and adds frequencies until its minima are resolved.
+        """Evaluates a curve over frequency, adding frequencies until its minima are resolved.
 
-        A narrow minimum between two frequencies of a fixed grid would be missed.
+        A fixed grid would miss a narrow minimum between two of its frequencies.
 
         Args:
             curve: Function that returns the values of the curve at given frequencies.
-            w_rad_s: First frequencies, rising, shape (F,), in rad/s.
-            level: Value of the curve below which bands of frequencies are reported.
+            w_rad_s: Initial frequencies in ascending order, shape (F,), in rad/s.
+            level: Value of the curve below which frequency bands are reported.
             tolerance: Function that returns the rounding error of the curve at given
                 frequencies. Smaller differences from the level, or between neighbouring values,
                 are ignored. `None` if there is no rounding error.
@@ -128,9 +128,9 @@ class Minima(NamedTuple):
 def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array:
     """Returns frequencies that resolve the phase of a delay, in rad/s, shape (F,).
 
-    The frequencies are evenly spaced on a logarithmic axis. Further frequencies are evenly
-    spaced on a linear axis, because a round trip over the longest delay T turns the phase once
-    in pi / T rad/s.
+    The frequencies are evenly spaced on a logarithmic axis. More frequencies are added with
+    even spacing on a linear axis, because a round trip with one-way delay T shifts the phase by
+    a full turn every pi / T rad/s.
 
     Args:
         low_hz: Lower end of the band, in Hz.
@@ -156,9 +156,9 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
 def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
     """Returns the frequency up to which a frequency grid resolves the phase of a delay, in Hz.
 
-    A signal that travels over a delay T and back makes the phase turn once in every interval of
-    1 / (2 T) Hz. Up to the returned frequency, the grid of `build_frequency_grid` has at least
-    four points in each of these intervals. Above it, the points are farther apart.
+    For a signal that travels there and back with delay T each way, the phase makes a full turn
+    every 1 / (2 T) Hz. Up to the returned frequency, the grid of `build_frequency_grid` has at
+    least four points per turn. Above it, the points are farther apart.
 
     Args:
         low_hz: Lowest frequency of the grid, in Hz.
@@ -183,16 +183,16 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
 
     Args:
         response: The response as a function of frequency.
-        w_rad_s: First frequencies, rising, shape (F,), in rad/s.
+        w_rad_s: Initial frequencies in ascending order, shape (F,), in rad/s.
 
     Returns:
-        All frequencies, rising, in rad/s.
+        All frequencies in ascending order, in rad/s.
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
-        """Marks neighbouring frequencies between which the response changes too much.
+        """Marks the grid steps over which the response changes too much.
 
-        These steps of the grid are then halved.
+        These steps are then halved.
         """
         size = np.linalg.norm(Y, axis=(1, 2))
         larger_size = np.maximum(size[1:], size[:-1])
@@ -246,11 +246,11 @@ def _refine(
 
 
 def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
-    """Returns a frequency response with its values at given frequencies stored.
+    """Returns a frequency response whose values at given frequencies are cached.
 
-    Several analyses evaluate the response at the same frequencies, and the values are then
-    computed only once. The stored values are returned whenever the function is called with this
-    very array.
+    Several analyses evaluate the response at the same frequencies, which are then computed only
+    once. The cached values are returned only when the function is called with this very array
+    object.
 
     Args:
         response: The function of frequency.
@@ -296,7 +296,7 @@ def _find_bands_below(
     w_rad_s: Array,
     values: Array,
     level: float,
-) -> tuple[FrequencyBand, ...]:
+) -> tuple[_FrequencyBand, ...]:
     """Returns the frequency bands in which a curve is below a level, such as zero.
 
     The edges of the bands are located by bisection.
@@ -328,4 +328,4 @@ def _find_bands_below(
         band_edges.append(float(w_rad_s[-1]))
     edges_hz = [edge / (2.0 * np.pi) for edge in band_edges]
     pairs = zip(edges_hz[::2], edges_hz[1::2], strict=True)
-    return tuple(FrequencyBand(from_hz, to_hz) for from_hz, to_hz in pairs)
+    return tuple(_FrequencyBand(from_hz, to_hz) for from_hz, to_hz in pairs)

@@ -1,23 +1,23 @@
-"""Predicts whether small motions of coupled arms die away, for a scenario or a log.
+"""Predicts whether small motions of coupled arms decay, for a scenario or a log.
 
-`analyse_linear_loop` does the work of the command `trilat linear`. It linearises the control
-loop about an equilibrium, a pose in which all arms rest, and computes its characteristic roots:
-the loop is stable if all roots have a negative real part. The roots are computed for the
-sampled loop, whose controllers compute once per period (tick), and for its continuous
-approximation. The result also contains the delay margin and, if requested, the settings at the
-edge of stability and what operators feel.
+`analyse_linear_loop` implements the command `trilat linear`. It linearises the control loop
+about an equilibrium, a pose in which all arms are at rest, and computes its characteristic
+roots: the loop is stable if all roots have a negative real part. The roots are computed for the
+sampled loop, whose controllers act once per tick, and for its continuous approximation. The
+result also contains the delay margin and, if requested, the settings at the edge of stability
+and what operators feel.
 
 Without a given pose, the analysis uses the loop of `loop_roots`, as a stability certificate
-does: the equilibrium nearest to the end of a run. For a log, the loop is that after all
+does: the equilibrium nearest to the end of a run. For a log, this is the loop after all
 commands, and the recorded run is not executed again. For a scenario, its run is simulated. Only
 if this run diverges, or if there is no equilibrium near its end, the equilibrium is predicted,
 or that of a longer run is used. If delays are random or measured, the sampled loop uses the
 delays that occurred in the last quarter of the run, and the continuous loop uses their means.
 
 Invariant:
-    - The verdict is based on the sampled loop. If a control law can be linearised in continuous
-      time only, the verdict is based on the continuous loop.
-    - The verdict holds for small motions about the equilibrium only.
+    - The verdict is based on the sampled loop, or on the continuous loop if a control law can
+      only be linearised in continuous time.
+    - The verdict holds only for small motions about the equilibrium.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ from ...errors import ScenarioError, UsageError
 from ...execution import FusedRun
 from ...log import Log
 from ...results import Result
-from ...scenario import IRREVERSIBLE_SHARES, Scenario, describe_law_conditions, load_scenario
+from ...scenario import IRREVERSIBLE_SHARES, Scenario, load_scenario
 from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
 from .characteristic_roots import CharacteristicRoot, Spectrum
@@ -41,7 +41,7 @@ from .equilibrium import add_limit_notes, find_equilibrium
 from .floquet import SamplesInUse, compute_sampled_spectrum
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses
-from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
+from .loop_roots import EndLoop, resolve_final_scenario
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .port_analysis import PortAnalysis
@@ -59,27 +59,27 @@ abs(s).
 
 @dataclass(frozen=True, repr=False)
 class LinearAnalysis(Result):
-    """Result of the linear stability analysis of coupled arms, see `analyse_linear_loop`.
+    """Result of the linear stability analysis of coupled arms (see `analyse_linear_loop`).
 
-    The arms are linearised about a pose of rest. The roots of the loop show whether small
-    motions about this pose decay, and for which network delays.
+    The arms are linearised about an equilibrium. The roots of the loop show whether small
+    motions about it decay, and for which network delays.
 
     Attributes:
-        scenario: The description of the experiment.
+        scenario: The scenario.
         conditions: The data from which the loop is built: dominance factors, delays, operators
-            and environments in force.
+            and environments in effect.
         rest: The equilibrium about which the loop is linearised.
         loop: The loop linearised at the equilibrium.
         continuous: Characteristic roots of the continuous loop, a delay-differential equation.
-        sampled: Characteristic roots of the loop with its ticks. `None` if a law can be
-            linearised in continuous time only.
+        sampled: Characteristic roots of the loop with its ticks, or `None` if a law can only be
+            linearised in continuous time.
         margin: The delays, common to all links, for which the continuous loop is stable.
         scans: For each requested key of the scenario, the values at which the loop becomes
             stable or unstable.
-        ports: Analysis of the joints at which operators act, the haptic ports. `None` if it was
-            not requested.
-        distance_rad: Largest difference between the last angle of a joint in the run and its
-            angle at the equilibrium, in rad. `None` if the equilibrium was not sought next to
+        ports: Analysis of the joints at which operators act (the haptic ports), or `None` if it
+            was not requested.
+        distance_rad: Largest difference between the final angle of a joint in the run and its
+            angle at the equilibrium, in rad, or `None` if the equilibrium was not sought near
             the end of a run.
     """
 
@@ -96,10 +96,9 @@ class LinearAnalysis(Result):
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
-        """Pose of each arm's end effector (tip) at rest, if end effectors follow each other.
+        """Pose of each arm's end effector at rest, if the arms follow with their end effectors.
 
-        There is an array for each arm. The arrays are empty if joints follow each other
-        instead.
+        One array per arm. The arrays are empty if the arms follow joint by joint instead.
         """
         sites = self.conditions.sites
         if not sites[0].layout.task:
@@ -108,10 +107,10 @@ class LinearAnalysis(Result):
 
     @property
     def decisive(self) -> Spectrum:
-        """The characteristic roots on which the verdict about stability is based.
+        """The characteristic roots on which the stability verdict is based.
 
-        These roots belong to the sampled loop, whose controllers compute once per tick. If a
-        control law can be linearised in continuous time only, the roots belong to the
+        These are the roots of the sampled loop, whose controllers act once per tick. If a
+        control law can only be linearised in continuous time, they are the roots of the
         continuous loop.
         """
         return self.continuous if self.sampled is None else self.sampled
@@ -120,13 +119,13 @@ class LinearAnalysis(Result):
     def verdict(self) -> str:
         """The verdict on small motions of the arms: "stable", "unstable" or "at the edge".
 
-        The roots in `decisive` determine the verdict.
+        The verdict follows from the roots in `decisive`.
         """
         return self.decisive.verdict
 
     @property
     def is_far_from_rest(self) -> bool:
-        """True if the run ends too far from the analysed pose of rest to be judged by it.
+        """True if the run ends too far from the analysed equilibrium to be judged by it.
 
         The limit is `NEAR_REST_RAD`. False for a scenario without a run, which has no final
         pose.
@@ -137,8 +136,8 @@ class LinearAnalysis(Result):
     def notes(self) -> tuple[str, ...]:
         """Remarks for the user that qualify the verdict of the linear analysis.
 
-        The remarks concern the analysed conditions (such as delays and operators), the pose of
-        rest about which the arms are linearised, and the characteristic roots.
+        The remarks refer to the analysed conditions (such as delays and operators), the
+        equilibrium about which the arms are linearised, and the characteristic roots.
         """
         notes = [*self.conditions.notes, *self.rest.notes]
         if self.is_far_from_rest:
@@ -163,17 +162,18 @@ class LinearAnalysis(Result):
         if self.scenario.has_irreversible_shares:
             notes.append(IRREVERSIBLE_SHARES.removeprefix("note: "))
         ticks_grow = self.sampled is not None and self.sampled.verdict == "unstable"
-        return (*notes, *describe_law_conditions(self.scenario, ticks_grow=ticks_grow))
+        return (*notes, *self.scenario.describe_law_conditions(ticks_grow=ticks_grow))
 
     def headline(self) -> str:
-        """The scenario, the verdict and the delay margin in one line, for the user.
+        """One line for the user with the scenario, the verdict and the delay margin.
 
-        The delay margin is the delay of all network links up to which the arms stay stable.
+        The delay margin is the delay, common to all network links, up to which the arms stay
+        stable.
         """
         return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the analysis to plain values, as `trilat linear --json` prints them.
+        """Converts the analysis to the plain values that `trilat linear --json` prints.
 
         Parts that were not requested, or that do not exist for this loop, are `None` or empty.
         """
@@ -237,10 +237,10 @@ class LinearAnalysis(Result):
         return delays_ms
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the characteristic roots, with a row per root.
+        """Returns a table of the characteristic roots, with one row per root.
 
-        The roots of the continuous loop come first. Then follow the roots of the sampled loop,
-        whose controllers compute once per tick, if they were computed.
+        The roots of the continuous loop come first, followed by those of the sampled loop
+        (whose controllers act once per tick), if they were computed.
         """
         spectra = {"continuous": self.continuous, "as computed": self.sampled}
         rows: list[dict[str, Any]] = []
@@ -256,13 +256,13 @@ class LinearAnalysis(Result):
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
         """Finds the root of the sampled loop that corresponds to a root of the continuous loop.
 
-        The nearest root is taken. It is worth showing only if the two roots differ.
+        This is the nearest root. It is only worth showing if the two roots differ.
 
         Args:
             root: A root of the continuous loop.
 
         Returns:
-            The sampled root. `None` if the two roots differ by less than 1 %, or if there is no
+            The sampled root, or `None` if the two roots differ by less than 1 % or there is no
             sampled root.
         """
         if self.sampled is None or not self.sampled.roots:
@@ -307,11 +307,11 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     try:
         if log is not None:
             scenario = resolve_final_scenario(log)
-            end = find_log_loop(log, own_laws=True)
+            end = EndLoop.of_log(log, own_laws=True)
         else:
             run = FusedRun(scenario)
             run.advance_to(scenario.duration_s)
-            end = find_run_loop(scenario, run)
+            end = EndLoop.of_run(scenario, run)
     except ScenarioError:
         return _AnalysedLoop(scenario, conditions, find_equilibrium(scenario))
 
@@ -333,29 +333,30 @@ def analyse_linear_loop(
     roots: int = DEFAULT_ROOTS,
     over: Sequence[str] = (),
     ports: bool = False,
-    hands: Sequence[HandMatrices] = (),
+    operators: Sequence[str | Path] = (),
 ) -> LinearAnalysis:
-    """Predicts whether small motions of the coupled arms of a scenario die away.
+    """Predicts whether small motions of the coupled arms of a scenario decay.
 
-    The control loop is linearised about a pose in which all arms rest.
+    The control loop is linearised about a pose in which all arms are at rest.
 
     Args:
-        source: A scenario (description of an experiment), its file, the name of a shipped
-            scenario, or the log of a run.
-        overrides: Settings of the scenario that are replaced. If there are any, only the
-            scenario of a log is used, and not its records.
-        pose: Pose of rest that all arms share, in rad. If `None`, the pose at the end of a run
-            is used.
+        source: A scenario, its file, the name of a shipped scenario, or the log of a run.
+        overrides: Settings of the scenario to replace. If there are any, only the scenario of a
+            log is used, not its records.
+        pose: Pose at rest that all arms share, in rad. If `None`, the final pose of a run is
+            used.
         roots: Number of characteristic roots to compute.
         over: Ranges of settings in which to search for the values at which stability changes,
             such as "control.d=0.1:3".
-        ports: True to analyse also what operators feel when they hold an arm.
-        hands: Measured impedances of operators. Any of them may hold the arm of any master.
+        ports: True to also analyse what operators feel when they hold an arm.
+        operators: Files of measured operators, from `trilat identify hand --json`. Any of them
+            may hold the arm of any master.
 
     Raises:
-        ScenarioError: The scenario is not valid, or cannot be linearised.
-        UsageError: Another argument is not valid.
+        ScenarioError: The scenario is invalid, or cannot be linearised.
+        UsageError: Another argument is invalid.
     """
+    hands = [HandMatrices.read(Path(file)) for file in operators]
     ranges = [parse_edge_range(text) for text in over]
     if not 1 <= roots <= MAX_ROOTS:
         raise UsageError(f"--roots must be from 1 to {MAX_ROOTS}, not {roots}")

@@ -1,21 +1,21 @@
 """Finds the values of a setting at which coupled arms become stable or unstable.
 
 For example, an edge of the damping gain of a slave is the gain at which its oscillations
-neither grow nor decay. The setting is a number of the scenario (the description of an
-experiment), named by its key. The growth rate of small motions is the real part of the
-rightmost characteristic root of the linearised control loop, and the loop is unstable if this
-rate is positive. The rate is evaluated for some values of the setting. Between two values at
-which the rate has different signs, Brent's method finds the zero of the rate, the edge.
+neither grow nor decay. The setting is a number in the scenario, named by its key. The growth
+rate of small motions is the real part of the rightmost characteristic root of the linearised
+control loop, and the loop is unstable if this rate is positive. The rate is evaluated for some
+values of the setting. Between two values at which the rate has different signs, Brent's method
+finds the zero of the rate, which is the edge.
 
-The sampled loop, whose controllers compute once per tick (period of the control loop), is
-analysed if the tick matters. This is the case for the integration scheme `digital` (zero-order
-hold, as in a plain digital controller), and for walls or operators that act once per tick.
-Otherwise the continuous loop is analysed.
+The sampled loop, whose controllers act once per tick, is analysed if the tick matters. This is
+the case for the integration scheme `digital` (zero-order hold, as in a plain digital
+controller), and for walls or operators that act once per tick. Otherwise the continuous loop is
+analysed.
 
 Invariant:
-    - The equilibrium, the pose of rest about which the arms are linearised, is determined once.
-      For every further value of the setting, the nearest equilibrium is used, so that the
-      results do not jump between different poses.
+    - The equilibrium about which the arms are linearised is determined once. For every further
+      value of the setting, the nearest equilibrium is used, which prevents the results from
+      jumping between different poses.
 """
 
 from collections.abc import Iterator, Sequence
@@ -71,19 +71,19 @@ def find_rightmost_root(
     *,
     sampled: bool,
 ) -> CharacteristicRoot | None:
-    """Returns the fastest growing (rightmost) root of the control loop about a pose of rest.
+    """Returns the fastest growing (rightmost) root of the control loop about an equilibrium.
 
-    The real part of this root is the growth rate of small motions. If the rate is negative, the
-    motions die away.
+    The real part of this root is the growth rate of small motions. If it is negative, the
+    motions decay.
 
     Args:
-        conditions: The gains, delays and weights of the loop.
+        conditions: The gains, delays and dominance factors of the loop.
         rest: The equilibrium.
-        sampled: True to analyse the sampled loop. If a law can be linearised in continuous time
-            only, the continuous loop is analysed nevertheless.
+        sampled: True to analyse the sampled loop. The continuous loop is analysed anyway if a
+            law can only be linearised in continuous time.
 
     Returns:
-        The root. `None` if all roots are zero.
+        The root, or `None` if all roots are zero.
     """
     spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
     if spectrum is None:
@@ -94,16 +94,16 @@ def find_rightmost_root(
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
     """Finds the state of a run in which an end effector has penetrated a wall most deeply.
 
-    The linear analysis then includes the stiffness of the wall. Only sampled walls are
-    considered, which compute their force once per tick (period of the control loop).
+    The linear analysis then includes the stiffness of the wall. Only sampled walls, which
+    compute their force once per tick, are considered.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
         q: Joint angles in K states of the run, for N arms with up to n joints, shape (K, N, n),
             in rad.
 
     Returns:
-        Index of the state. `None` if no wall is touched.
+        Index of the state, or `None` if no wall is touched.
     """
     depth_m = np.full(len(q), -np.inf)
     for site_index, name in enumerate(scenario.names):
@@ -123,20 +123,20 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
 def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
     """Returns the growth rate of small motions while an arm touches a wall, in 1/s.
 
-    Only sampled walls are considered, which compute their force once per tick (period of the
-    control loop). The arms are linearised at the equilibrium nearest to the state of a run that
-    is deepest in a wall. The mean of the states is not suitable, because an arm that chatters
-    leaves the wall again and again.
+    Only sampled walls, which compute their force once per tick, are considered. The arms are
+    linearised at the equilibrium nearest to the state of a run that is deepest in a wall. The
+    mean of the states is not suitable, because a chattering arm leaves the wall again and
+    again.
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
         q: Joint angles in K states of the run, for N arms with up to n joints, shape (K, N, n),
             in rad.
         theta_hat: Estimates of the arms' P parameters in these states, shape (K, N, P).
 
     Returns:
-        The growth rate. It is -infinity if nothing moves. It is NaN if no wall is touched, or
-        if the scenario cannot be linearised.
+        The growth rate, -infinity if nothing moves, or NaN if no wall is touched or the
+        scenario cannot be linearised.
     """
     deepest = find_deepest_contact(scenario, q)
     if deepest is None:
@@ -157,7 +157,7 @@ class LinearEdge(NamedTuple):
     """A value of one setting at which coupled arms become stable or unstable.
 
     At this value a characteristic root crosses the imaginary axis, and small motions oscillate
-    with the frequency of the root.
+    at the frequency of the root.
 
     Attributes:
         key: Key of the scenario, such as "control.d".
@@ -175,13 +175,13 @@ class LinearEdge(NamedTuple):
 class EdgeScan(NamedTuple):
     """Values of one setting, within a range, at which coupled arms become stable or unstable.
 
-    Without such a value, the arms are either stable or unstable in the whole range.
+    If there is no such value, the arms are either stable or unstable throughout the range.
 
     Attributes:
         key: Key of the scenario, such as "control.d".
         low: Lower end of the scanned range.
         high: Upper end of the scanned range.
-        edges: The values, rising, with the roots that cross there.
+        edges: The values in ascending order, with the roots that cross there.
     """
 
     key: str
@@ -194,7 +194,7 @@ def parse_edge_range(text: str) -> tuple[str, float, float]:
     """Parses a setting and the range of values in which to search for a stability limit.
 
     Args:
-        text: The text, for example "control.d=0.1:3".
+        text: The string to parse, for example "control.d=0.1:3".
     """
     key, _, ends = text.partition("=")
     low, colon, high = ends.partition(":")
@@ -220,11 +220,11 @@ def iterate_linear_edges(
 ) -> Iterator[LinearEdge]:
     """Yields the values of one setting at which coupled arms become stable or unstable.
 
-    The range of values is scanned, and each change of stability is then located. The values
-    rise.
+    The range of values is scanned, and each change of stability is then located. The values are
+    in ascending order.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: The scenario.
         key: Key of the scenario, such as "control.d".
         low: Lower end of the range.
         high: Upper end of the range.
@@ -232,10 +232,10 @@ def iterate_linear_edges(
             varies.
         points: Number of values that the scan evaluates.
         sampled: True to analyse the loop with its ticks, False to analyse the continuous loop.
-            `None` to choose as the module's docstring says.
+            If `None`, this is chosen as described in the docstring of the module.
 
     Raises:
-        ScenarioError: A value is not valid for that key, or the scenario has no linear loop.
+        ScenarioError: A value is invalid for that key, or the scenario has no linear loop.
         UsageError: The range is empty.
     """
     is_valid_range = np.isfinite([low, high]).all() and low < high and points >= 2
@@ -276,7 +276,8 @@ class _GrowthPoint(NamedTuple):
     def is_unstable(self) -> bool:
         """True if small motions of the arms grow at this value of the setting.
 
-        The limit of stability lies between a stable and an unstable neighbouring value.
+        A stability limit lies between neighbouring values of which one is stable and the other
+        unstable.
         """
         return self.growth_per_s > 0.0
 
@@ -312,16 +313,16 @@ class _GrowthRate:
         self._root: CharacteristicRoot | None = None
 
     def evaluate(self, value: float) -> float:
-        """Computes how fast small motions grow if the examined setting has a given value.
+        """Computes the growth rate of small motions for a given value of the examined setting.
 
-        The setting is a number of the scenario, such as a gain.
+        The setting is a number in the scenario, such as a gain.
 
         Args:
             value: Value of the setting, in its own unit.
 
         Returns:
-            The growth rate, in 1/s, which is negative if motions decay. It is -infinity if
-            there are no moving modes.
+            The growth rate, in 1/s, which is negative if motions decay, and -infinity if there
+            are no moving modes.
         """
         typed_value = round(value) if self.takes_integers else value
         scenario = load_scenario(self._scenario, {self._key: typed_value})
@@ -334,11 +335,10 @@ class _GrowthRate:
         return -np.inf if self._root is None else self._root.s.real
 
     def close_edge(self, left: _GrowthPoint, right: _GrowthPoint) -> LinearEdge:
-        """Finds where the coupled arms change between stable and unstable, between two values.
+        """Locates the change between stable and unstable arms between two values of a setting.
 
-        The values belong to one setting of the scenario, such as a gain. Exactly one of them
-        gives an unstable loop. Settings with whole numbers are searched by bisection, all
-        others by Brent's method.
+        Exactly one of the two values gives an unstable loop. Integer settings are searched by
+        bisection, all others with Brent's method.
 
         Args:
             left: The smaller value, with its growth rate.
@@ -380,14 +380,14 @@ class GrowthColumn(NamedTuple):
     A positive rate means that the arms are unstable at this value.
 
     Attributes:
-        growth_per_s: Growth rate for each value, in 1/s, which is the real part of the
-            rightmost characteristic root. It is NaN if the scenario cannot be linearised, and
-            -infinity if nothing moves.
+        growth_per_s: Growth rate for each value, in 1/s: the real part of the rightmost
+            characteristic root. It is NaN if the scenario cannot be linearised, and -infinity
+            if nothing moves.
         edges: Values at which stability changes. The key n means that the change lies between
             the values n and n + 1.
         remarks: Remarks for the user on the analysis, without repetition.
-        is_sampled: True if the roots follow from Floquet multipliers of the loop with its
-            ticks, False if the loops were analysed in continuous time.
+        is_sampled: True if the roots were computed from Floquet multipliers of the loop with
+            its ticks, False if the loops were analysed in continuous time.
     """
 
     growth_per_s: list[float]
@@ -406,15 +406,16 @@ class GrowthColumn(NamedTuple):
     ) -> "GrowthColumn":
         """Computes how the growth of small motions depends on one setting of a scenario.
 
-        For each value of the setting, the coupled arms are linearised about a pose of rest.
-        This pose is tracked from one value to the next. Between a stable and an unstable
-        neighbouring value, the value at which stability changes is located.
+        For each value of the setting, the coupled arms are linearised about an equilibrium,
+        which is tracked from one value to the next. Wherever stability changes between
+        neighbouring values, the exact value at which it changes is located.
 
         Args:
-            scenarios: The experiments, which differ in the setting only, by its rising value.
+            scenarios: Scenarios that differ only in the setting, in ascending order of its
+                value.
             key: Name of the setting, such as "control.d".
             values: Values of the setting, one per scenario.
-            at_mean_pose: True to linearise each scenario about the rest that is nearest to the
+            at_mean_pose: True to linearise each scenario about the equilibrium nearest to the
                 mean of its start poses, with true estimates. No run is simulated in this case.
 
         Returns:
@@ -453,35 +454,35 @@ class GrowthColumn(NamedTuple):
 
         return column
 
+    @staticmethod
+    def find_crossings(
+        scenario: Scenario,
+        key: str,
+        low: float,
+        high: float,
+    ) -> tuple[tuple[float, ...], str]:
+        """Finds the values of one setting at which coupled arms become stable or unstable.
 
-def find_root_crossings(
-    scenario: Scenario,
-    key: str,
-    low: float,
-    high: float,
-) -> tuple[tuple[float, ...], str]:
-    """Finds the values of one setting at which coupled arms become stable or unstable.
+        An example is the smallest damping gain with which the arms are stable.
 
-    An example is the smallest damping gain with which the arms are stable.
+        Args:
+            scenario: The scenario. The equilibrium is determined with its own value of the
+                setting.
+            key: Name of the setting, such as "control.d".
+            low: Smallest value to examine.
+            high: Largest value to examine.
 
-    Args:
-        scenario: Description of the experiment. The pose of rest is determined with its own
-            value of the setting.
-        key: Name of the setting, such as "control.d".
-        low: Smallest value to examine.
-        high: Largest value to examine.
-
-    Returns:
-        The values at which stability changes, rising. If the scenario cannot be linearised,
-        there are none.
-        A remark for the user on the analysis. Empty if there is none.
-    """
-    try:
-        rest, remark = _assume_equilibrium(scenario, None)
-        edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
-        return tuple(edge.value for edge in edges), remark
-    except ScenarioError as error:
-        return (), f"no linear analysis: {error.problem}"
+        Returns:
+            The values at which stability changes, in ascending order. Empty if the scenario
+            cannot be linearised.
+            A remark for the user on the analysis. Empty if there is none.
+        """
+        try:
+            rest, remark = _assume_equilibrium(scenario, None)
+            edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
+            return tuple(edge.value for edge in edges), remark
+        except ScenarioError as error:
+            return (), f"no linear analysis: {error.problem}"
 
 
 def _assume_equilibrium(

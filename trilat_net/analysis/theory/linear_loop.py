@@ -1,23 +1,23 @@
-"""Linearises the control loop of all arms about a pose of rest, with network delays.
+"""Linearises the control loop of all arms about an equilibrium, with network delays.
 
-For small deviations x from the pose of rest, the result is a differential equation with delays:
+For small deviations x from the equilibrium, the result is a differential equation with delays:
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
 The state x contains, for each arm, its joint angles, its joint velocities, and the parameter
-estimates of its control law. The inputs u are the torques that operators add on the joints, the
-outputs y are the joint velocities, T_k are the delays of the network, and A, A_k, B, B_k and C
-are constant matrices.
+estimates of its control law. The inputs u are the torques that operators add at the joints, the
+outputs y are the joint velocities, T_k are the network delays, and A, A_k, B, B_k and C are
+constant matrices.
 
-For an arm with n joints in a chain, the control law may estimate ten parameters theta_hat per
-link. Only one combination of them per joint acts on small motions: the estimated gravity torque
-z = Y_G theta_hat, in N m. Y_G is the regressor of the gravity torque, the matrix that
-multiplies the parameters, at rest. The torque z therefore replaces the estimates in x. Its rate
-is z' = -Y_G Gamma Y' r, with the regressor Y of the control law, its adaptation gain Gamma, and
-its filtered error r = e' + Lambda e. Here e is the error of the joint angles and Lambda a gain.
-The remaining combinations are omitted. They only add roots at zero.
+For a chain with n joints, the control law may estimate ten parameters theta_hat per link. Only
+one combination of them per joint affects small motions: the estimated gravity torque z = Y_G
+theta_hat, in N m, where Y_G is the regressor of the gravity torque (the matrix that multiplies
+the parameters) at rest. The torque z therefore replaces the estimates in x. Its rate is z' =
+-Y_G Gamma Y' r, with the regressor Y of the control law, its adaptation gain Gamma, and its
+filtered error r = e' + Lambda e, where e is the error of the joint angles and Lambda a gain.
+The remaining combinations are omitted, since they only add roots at zero.
 
-In task space, where end effectors instead of joints follow each other, the arms are coupled
+In task space, where end effectors follow each other instead of joints, the arms are coupled
 through the poses and velocities of their end effectors.
 """
 
@@ -41,10 +41,10 @@ _DEPENDENT = 1e-9
 
 
 class SiteJacobian(NamedTuple):
-    """Linear model of one site (a process that runs one arm) about a pose of rest.
+    """Linear model of one site about an equilibrium.
 
     It contains the derivatives of the site's rates of change with respect to its states and to
-    the values that it receives from the other sites. States that small motions do not change,
+    the values that it receives from the other sites. States that are constant in small motions,
     or that have no effect on the motion, are left out.
 
     Attributes:
@@ -63,9 +63,9 @@ class SiteJacobian(NamedTuple):
 
     @property
     def output(self) -> Array:
-        """Matrix from the states of an arm to the values that the arm sends to the others.
+        """Matrix that maps the states of an arm to the values that it sends to the others.
 
-        The values are its pose, the velocity of this pose, and the external torque, with m
+        These values are its pose, the velocity of this pose, and the external torque, with m
         entries each. The matrix has the shape (3 m, states).
         """
         rates = self.rates
@@ -81,17 +81,17 @@ class SiteJacobian(NamedTuple):
         *,
         all_estimates: bool = False,
     ) -> "list[SiteJacobian]":
-        """Builds the linear model of each site by itself about a pose of rest.
+        """Builds a separate linear model of each site about an equilibrium.
 
-        A site is a process that runs one arm. The model contains the derivatives of its rates
-        of change with respect to its own states and to its inputs.
+        Each model contains the derivatives of the site's rates of change with respect to its
+        own states and its inputs.
 
         Args:
             conditions: The sites, gains and delays of the coupled arms.
-            rest: The pose of rest, with the parameter estimates.
-            all_estimates: True to keep every parameter estimate of a chain of joints as a
-                state. By default, only their combinations that act on small motions are states:
-                the estimated gravity torques of the joints.
+            rest: The equilibrium, with the parameter estimates.
+            all_estimates: True to keep every parameter estimate of a chain as a state. By
+                default, only the combinations that affect small motions are states: the
+                estimated gravity torques of the joints.
 
         Returns:
             The models, in the order of the sites.
@@ -128,8 +128,8 @@ class SiteJacobian(NamedTuple):
 class DelayedTerm(NamedTuple):
     """Effect of all states and torques on the coupled arms after one particular delay T.
 
-    It is the term A x(t - T) + B u(t - T) in the differential equation of the loop. x contains
-    the n states, and u the m torques of operators on the joints.
+    This is the term A x(t - T) + B u(t - T) in the differential equation of the loop. x
+    contains the n states, and u the m operator torques at the joints.
 
     Attributes:
         delay_s: The delay T, in s.
@@ -144,24 +144,24 @@ class DelayedTerm(NamedTuple):
 
 
 class LinearLoop(NamedTuple):
-    """Linear model of the coupled arms near a pose of rest, with network delays.
+    """Linear model of the coupled arms near an equilibrium, with network delays.
 
-    It shows whether small motions about this pose grow. The module's docstring has the equation
-    and the notation.
+    It shows whether small motions about the equilibrium grow. The docstring of the module has
+    the equation and the notation.
 
     Attributes:
         names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".
-        inputs: Names of the torques on the joints, such as "m1.tau1".
+        inputs: Names of the joint torques, such as "m1.tau1".
         outputs: Names of the joint velocities, such as "m1.qd1".
         A: Matrix of the states, shape (n, n).
         B: Matrix of the inputs, shape (n, m).
         C: Matrix of the outputs, shape (p, n).
-        delayed: One entry per distinct delay above zero, by rising delay.
-        omitted_states: Number of states that were left out because small motions do not change
-            them or do not depend on them. Each has a root at zero.
-        E: Diagonal of the matrix E in E x' = A x + ..., shape (n,): 1 for a state with a rate,
-            0 for a state that an algebraic equation determines, such as a wave. `None` if every
-            state has a rate.
+        delayed: One entry per distinct delay above zero, in ascending order of delay.
+        omitted_states: Number of states that were left out because they are constant in small
+            motions or do not affect them. Each has a root at zero.
+        E: Diagonal of the matrix E in E x' = A x + ..., shape (n,): 1 for a differential state,
+            0 for a state determined by an algebraic equation, such as a wave. `None` if every
+            state is differential.
     """
 
     names: tuple[str, ...]
@@ -178,11 +178,36 @@ class LinearLoop(NamedTuple):
     def static_matrix(self) -> Array:
         """Sum of the matrices of present and delayed states, A + sum_k A_k, shape (n, n).
 
-        It gives the rates of change of the n states while these states are constant, because
-        delays then have no effect.
+        While the n states are constant, delays have no effect, and this matrix gives the rates
+        of change of the states.
         """
         delayed = [term.A for term in self.delayed]
         return sum(delayed, self.A)
+
+    @property
+    def longest_delay_s(self) -> float:
+        """Longest delay of any network link or signal, in s. 0 if there are no delays."""
+        delays_s = [term.delay_s for term in self.delayed]
+        return max(delays_s, default=0.0)
+
+    def set_common_delay(self, delay_s: float) -> "LinearLoop":
+        """Returns the loop with the same delay on all links, for example to check a margin.
+
+        Args:
+            delay_s: The delay, in s. With 0, the loop has no delayed terms.
+        """
+        if not self.delayed:
+            return self
+        state_matrices = [term.A for term in self.delayed]
+        input_matrices = [term.B for term in self.delayed]
+        delayed_A = np.sum(state_matrices, axis=0)
+        delayed_B = np.sum(input_matrices, axis=0)
+        if delay_s == 0.0:
+            A = self.A + delayed_A
+            B = self.B + delayed_B
+            return self._replace(A=A, B=B, delayed=())
+        term = DelayedTerm(delay_s, delayed_A, delayed_B)
+        return self._replace(delayed=(term,))
 
     @classmethod
     def of_conditions(
@@ -192,17 +217,17 @@ class LinearLoop(NamedTuple):
         *,
         all_estimates: bool = False,
     ) -> "LinearLoop":
-        """Builds the linear model of the coupled arms for small motions about a pose of rest.
+        """Builds the linear model of the coupled arms for small motions about an equilibrium.
 
-        The model contains all sites (processes that each run one arm) and the links between
-        them with their delays. Its inputs are the torques of operators on the joints.
+        The model contains all sites and the delayed links between them. Its inputs are the
+        operator torques at the joints.
 
         Args:
             conditions: The sites, gains and delays of the coupled arms.
-            rest: The pose of rest, with the parameter estimates.
-            all_estimates: True to keep every parameter estimate of a chain of joints as a
-                state. By default, only their combinations that act on small motions are states:
-                the estimated gravity torques of the joints.
+            rest: The equilibrium, with the parameter estimates.
+            all_estimates: True to keep every parameter estimate of a chain as a state. By
+                default, only the combinations that affect small motions are states: the
+                estimated gravity torques of the joints.
 
         Returns:
             The model, a linear differential equation with delays.
@@ -267,12 +292,12 @@ class LinearLoop(NamedTuple):
 
 
 def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
-    """Returns a matrix with given matrices (blocks) on its diagonal, and zeros elsewhere.
+    """Returns a block-diagonal matrix.
 
     `scipy.linalg.block_diag` does the same, but takes twenty times as long for small blocks.
 
     Args:
-        blocks: The blocks, from the upper left one.
+        blocks: The blocks, starting from the upper left.
     """
     rows, columns = np.sum([block.shape for block in blocks], axis=0)
     matrix = np.zeros((rows, columns))
@@ -290,15 +315,15 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     """Collects the states and inputs of each site when all arms are at rest.
 
     The states are joint angles, joint velocities and parameter estimates. The inputs are the
-    values that a site (process that runs one arm) receives from the other sites, and the
-    external torque. `ArgumentLayout` describes their order.
+    values that a site receives from the other sites, and the external torque. `ArgumentLayout`
+    defines their order.
 
     Args:
         conditions: The sites, gains and delays of the coupled arms.
-        rest: The pose of rest, with the parameter estimates.
+        rest: The equilibrium, with the parameter estimates.
 
     Returns:
-        A vector for each site, with the length that its `ArgumentLayout` states.
+        One vector per site, with the length stated by its `ArgumentLayout`.
     """
     layouts = [site_dynamics.ArgumentLayout.of_site(site) for site in conditions.sites]
     arguments = [np.zeros(layout.arguments) for layout in layouts]
@@ -332,16 +357,16 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
 
 
 def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that each arm sends to the other arms while all of them rest.
+    """Computes the pose that each arm sends to the other arms while all of them are at rest.
 
-    It consists of the joint angles, or in task space of the pose of the end effector (tip).
+    The pose consists of the joint angles, or in task space of the pose of the end effector.
 
     Args:
         conditions: The sites, gains and delays of the loop.
         rest: The equilibrium.
 
     Returns:
-        A pose for each site, shape (m,).
+        One pose per site, shape (m,).
     """
     poses = []
     for site, q in zip(conditions.sites, rest.q, strict=True):
@@ -352,7 +377,7 @@ def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> 
 
 
 def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose at rest that the control law of each arm tries to reach.
+    """Computes the pose that the control law of each arm tries to reach at rest.
 
     This pose, the reference, is the mean of the other arms' poses, weighted with the dominance
     factors.
@@ -362,7 +387,7 @@ def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> li
         rest: The equilibrium.
 
     Returns:
-        A reference for each site, shape (m,).
+        One reference per site, shape (m,).
     """
     poses = compute_shared_poses(conditions, rest)
     if not conditions.sites[0].layout.task:
@@ -424,18 +449,18 @@ def compute_couplings(
 ) -> dict[tuple[int, int], Array]:
     """Computes how the values that each site sends act on the inputs of the other sites.
 
-    A site (process that runs one arm) sends its pose, its velocity and its reflected torque,
-    with m numbers each. A receiver weights them with its dominance factors (weights with which
-    it follows the other arms). The control law of a user also receives them without weights.
+    A site sends its pose, its velocity and its reflected torque, with m entries each. A
+    receiver weights them with its dominance factors. The control law of a user also receives
+    them unweighted.
 
     Args:
         conditions: The sites, gains and delays of the coupled arms.
-        rest: The pose of rest about which the arms are linearised.
+        rest: The equilibrium about which the arms are linearised.
         sites: Linear model of each site by itself, without the other sites.
 
     Returns:
-        For each pair (i, j), the effect of the values that site j sends on the inputs of site
-        i, shape (inputs, 3 m).
+        For each pair (i, j), the effect of the values sent by site j on the inputs of site i,
+        shape (inputs, 3 m).
     """
     references = _differentiate_references(conditions, rest)
     couplings = {}
@@ -464,16 +489,15 @@ def compute_couplings(
 def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
     """Finds which states of each site belong to the linear model of the coupled arms.
 
-    A site is a process that runs one arm. Its joint angles and velocities always belong to the
-    model. Its parameter estimates belong to the model if its control law changes them. The same
-    holds for the memory of a user's control law.
+    Joint angles and velocities always belong to the model. The parameter estimates, or the
+    memory of a user's control law, belong to it if the control law changes them.
 
     Args:
         conditions: The sites and their control laws.
 
     Returns:
-        For each site a mask of its states (angles, velocities, estimates), shape (states,). It
-        is True for states in the model.
+        For each site, a boolean mask over its states (angles, velocities, estimates), shape
+        (states,).
     """
     masks = []
     for site in conditions.sites:
@@ -767,14 +791,14 @@ def _add_form(
     def find_delayed_matrix(j: int) -> Array:
         """Returns the matrix through which delayed states of all arms act on the loop.
 
-        The delay is the age of the samples (sent states) of site j when site i uses them. If no
-        matrix for this delay exists, a zero matrix is added.
+        The delay is the age of the samples of site j when site i uses them. If no matrix for
+        this delay exists, a zero matrix is added.
 
         Args:
             j: Index of the site that sends the samples.
 
         Returns:
-            The matrix, shape (n, n), with the n states of the loop. The caller changes it in
+            The matrix, shape (n, n) for the n states of the loop. The caller modifies it in
             place.
         """
         delay_s = float(conditions.age_s[i, j])

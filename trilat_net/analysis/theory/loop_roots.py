@@ -1,26 +1,27 @@
 """Computes the characteristic roots of the control loop at the end of a run, for all commands.
 
-If all roots have a negative real part, small motions about the last pose of the run die away.
-The control loop of the coupled arms may change during a run, by planned changes or commands.
-Therefore this module first finds the final loop: the delays, weights, operators and
-environments that are in force at the end. Then it linearises this loop at the last pose.
+If all roots have a negative real part, small motions about the final pose of the run decay. The
+control loop of the coupled arms may change during a run, through planned changes or commands.
+This module therefore first finds the final loop: the delays, weights, operators and
+environments in effect at the end. It then linearises this loop at the final pose.
 
 The delays of the final loop are known if they are constant, or follow sinusoids or tables that
-repeat. If a table has ended, its last delay is constant. Random and measured delays are known
-from the records only. The roots are then those for the delays that occurred in the last quarter
-of the records.
+repeat. If a table has ended, its last delay remains in effect. Random and measured delays are
+known only from the records. The roots are then those for the delays that occurred in the last
+quarter of the records.
 
 Invariant:
     - Roots are called exact only if every delay is constant or repeats after the analysed
-      period, if the loop is analysed with its ticks (the periods of its controllers), and if
-      the rightmost root has the same sign at the last pose and at the nearest pose of rest.
-    - A command that sets a link or a dominance factor to its present value counts as no change.
+      period, if the loop is analysed with its ticks, and if the rightmost root has the same
+      sign at the final pose and at the nearest equilibrium.
+    - A command that sets a link or a dominance factor to its present value is not counted as a
+      change.
     - The code of imported control laws is executed only with permission. Without permission, no
       roots are computed for such a loop.
     - With permission, unstable roots count as exact and stable ones do not, because the law may
       contain thresholds that its derivative at the pose does not show. The same rule applies to
-      sampled walls, because an arm may oscillate at a wall although the pose of rest next to
-      the wall is stable.
+      sampled walls, because an arm may oscillate at a wall although the equilibrium next to the
+      wall is stable.
 """
 
 import math
@@ -35,9 +36,8 @@ from ...core import BUCKETS_PER_S, Array
 from ...errors import ScenarioError
 from ...execution import FusedRun
 from ...log import Ints, Log
-from ...own_code import ImportedLaw
 from ...records import NS_PER_S, Mode
-from ...scenario import ConstantDelay, LinkBase, Scenario
+from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
 from ..delay_period import find_final_link, is_ending_trace
@@ -63,10 +63,10 @@ _BATCH_RECORDS = 4096
 """Number of records of each site that are read from a simulated run at a time."""
 
 
-class _EndLoop(NamedTuple):
-    """Control loop of all arms as it was at the end of a run, with its pose of rest.
+class EndLoop(NamedTuple):
+    """Control loop of all arms at the end of a run, with its equilibrium.
 
-    The loop is linearised about this pose to decide whether small motions die away.
+    The loop is linearised about the equilibrium to decide whether small motions decay.
 
     Attributes:
         scenario: The scenario up to the end of the run. Delays that only the run shows are
@@ -77,11 +77,11 @@ class _EndLoop(NamedTuple):
             measured. `None` if the scenario determines all delays.
         has_mean_ages: True if the age of the samples on some link is a mean over the last
             quarter of the run.
-        distance_rad: Largest difference between the last angle of a joint and its angle at
-            the rest, in rad.
-        last_pose: The last pose of the run. `None` if it is the pose of rest. Arms that no
+        distance_rad: Largest difference between the final angle of a joint and its angle at the
+            equilibrium, in rad.
+        last_pose: The final pose of the run, or `None` if it is the equilibrium. Arms that no
             operator holds may come to rest anywhere between the two.
-        programs: Sites whose arms a program of the user moves. The reaction of the program to
+        programs: Sites whose arms are moved by a user's program. The reaction of the program to
             the arms is not part of the linearised loop.
     """
 
@@ -94,12 +94,125 @@ class _EndLoop(NamedTuple):
     last_pose: Equilibrium | None = None
     programs: tuple[str, ...] = ()
 
+    @classmethod
+    def of_log(cls, log: Log, *, own_laws: bool = False) -> "EndLoop":
+        """Finds the control loop at the end of a recorded run, and the nearest equilibrium.
+
+        The linear analysis of this loop shows whether the run is stable.
+
+        Args:
+            log: The log of the run.
+            own_laws: True if the code of imported control laws may be executed.
+
+        Raises:
+            ScenarioError: The loop cannot be linearised, or the run did not end near an
+                equilibrium.
+        """
+        site_logs = [log[site] for site in log.sites]
+        if not all(map(len, site_logs)):
+            raise ScenarioError("a site has no records", source=log.source)
+        for site_log in site_logs:
+            _check_mode(site_log.name, site_log.mode[-1], log.source)
+
+        def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
+            """Returns which samples of another arm were in use at given ticks.
+
+            Samples are numbered from 0. For a tick without a record, the samples of the last
+            preceding record are returned.
+
+            Args:
+                i: Index of the receiving site.
+                j: Index of the peer that sent the samples.
+                ticks: Ticks of the receiving site, shape (K,).
+
+            Returns:
+                Numbers of the samples, shape (K,). Negative before the first sample.
+            """
+            site_log = site_logs[i]
+            rows_after = np.searchsorted(site_log.tick, ticks, side="right")
+            rows = np.maximum(rows_after - 1, 0)
+            used: Ints = site_log.used[log.sites[j]][rows]
+            return used
+
+        last_ticks = [int(site_log.tick[-1]) for site_log in site_logs]
+        final = _fix_delays(resolve_final_scenario(log), last_ticks, read_used_samples)
+        trace = RunTrace.of_log(log)
+        state = None
+        if _has_sampled_wall(final.scenario):
+            motions = [
+                _SiteMotion(part.t_s, part.q, part.qd, part.theta_hat) for part in site_logs
+            ]
+            state = _find_state_in_wall(final.scenario, motions)
+        if state is None:
+            theta_hat = [site_log.theta_hat[-1] for site_log in site_logs]
+            state = _choose_end_state(final.scenario, trace, theta_hat)
+        loop = _build_end_loop(final, state, trace, own_laws=own_laws)
+        return loop._replace(programs=tuple(list_program_sites(log)))
+
+    @classmethod
+    def of_run(cls, scenario: Scenario, run: FusedRun) -> "EndLoop":
+        """Finds the control loop at the end of a simulated run, and the nearest equilibrium.
+
+        The linear analysis of this loop shows whether the run is stable. The code of imported
+        control laws is executed.
+
+        Args:
+            scenario: The scenario of the run.
+            run: The run in the fused loop.
+
+        Raises:
+            ScenarioError: The loop cannot be linearised, or the run did not end near an
+                equilibrium.
+        """
+        if run.diverged_s is not None:
+            _check_mode(scenario.names[0], "diverged", scenario.name)
+        for i, name in enumerate(scenario.names):
+            mode = Mode(int(run.arrays(i).site[0]["mode"]))
+            _check_mode(name, mode.name.lower(), scenario.name)
+        ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
+        last_ticks = [ended.ticks(name) - 1 for name in ended.names]
+
+        def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
+            """Returns which samples of another arm were in use, according to the delay model.
+
+            This corresponds to `read_used_samples` in `of_log`. A simulated run without a log
+            has no records, but the random delays of the link can be drawn again from its seed.
+            The drawn delays include the planned changes and outages of the link.
+
+            Args:
+                i: Index of the receiving site.
+                j: Index of the peer that sent the samples.
+                ticks: Ticks of the receiving site, shape (K,).
+
+            Returns:
+                Numbers of the samples, shape (K,). -1 before the first sample.
+            """
+            used = run.read_samples_in_use(i, last_ticks[i] + 1)
+            # A site is not its own peer, so the peers after it move up by one column.
+            samples: Ints = used[ticks, j - (j > i)]
+            return samples
+
+        final = _fix_delays(ended, last_ticks, draw_samples)
+        trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
+        state = None
+        if _has_sampled_wall(ended):
+            state = _find_state_in_wall(ended, _record_motions(ended))
+        if state is None:
+            theta_hat = []
+            for name, record in zip(ended.names, run.records, strict=True):
+                columns = ended.layout(name).columns()
+                theta_hat.append(record[columns["theta_hat"]])
+            state = _choose_end_state(ended, trace, theta_hat)
+        loop = _build_end_loop(final, state, trace, own_laws=True)
+        programs = [site for site in scenario.names if scenario.sites[site].has_program_hand]
+        return loop._replace(programs=tuple(programs))
+
 
 @limit_blas_threads()
 def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
-    """Decides by linear analysis whether small motions at the end of a recorded run die away.
+    """Decides by linear analysis whether small motions at the end of a recorded run decay.
 
-    The coupled arms are linearised at the pose of rest nearest to the last pose. The result may
+    The coupled arms are linearised at the equilibrium nearest to the final pose. The result may
     prove the run stable, or refute it.
 
     Args:
@@ -111,7 +224,7 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
         The roots of the final loop, or the reason why there are none.
     """
     try:
-        loop = find_log_loop(log, own_laws=own_laws)
+        loop = EndLoop.of_log(log, own_laws=own_laws)
     except ScenarioError as error:
         return _explain_no_roots(error.problem)
     return _compute_roots(loop)
@@ -119,135 +232,23 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
 
 @limit_blas_threads()
 def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
-    """Decides by linear analysis whether small motions at the end of a simulated run die away.
+    """Decides by linear analysis whether small motions at the end of a simulated run decay.
 
-    The result is that of `find_log_roots` for a log of the same run, but no log is needed.
+    The result equals that of `find_log_roots` for a log of the same run, but no log is needed.
     Studies with many runs use this function.
 
     Args:
-        scenario: The experiment.
-        run: Its run in the fused loop.
+        scenario: The scenario of the run.
+        run: The run in the fused loop.
 
     Returns:
         The roots of the loop at the end of the run, or the reason why there are none.
     """
     try:
-        loop = find_run_loop(scenario, run)
+        loop = EndLoop.of_run(scenario, run)
     except ScenarioError as error:
         return _explain_no_roots(error.problem)
     return _compute_roots(loop)
-
-
-def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
-    """Finds the control loop at the end of a recorded run, and the nearest pose of rest.
-
-    The linear analysis of this loop shows whether the run is stable.
-
-    Args:
-        log: The log of the run.
-        own_laws: True if the code of imported control laws may be executed.
-
-    Raises:
-        ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
-            rest.
-    """
-    site_logs = [log[site] for site in log.sites]
-    if not all(map(len, site_logs)):
-        raise ScenarioError("a site has no records", source=log.source)
-    for site_log in site_logs:
-        _check_mode(site_log.name, site_log.mode[-1], log.source)
-
-    def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns which messages of another arm were in use at given ticks, from the records.
-
-        Such a message, a sample, is the state that an arm sends once per tick (control period).
-        Samples are numbered from 0. For a tick without a record, the samples of the last record
-        before it are returned.
-
-        Args:
-            i: Index of the receiving site.
-            j: Index of the peer that sent the samples.
-            ticks: Ticks of the receiving site, shape (K,).
-
-        Returns:
-            Numbers of the samples, shape (K,). Negative before the first sample.
-        """
-        site_log = site_logs[i]
-        rows_after = np.searchsorted(site_log.tick, ticks, side="right")
-        rows = np.maximum(rows_after - 1, 0)
-        used: Ints = site_log.used[log.sites[j]][rows]
-        return used
-
-    last_ticks = [int(site_log.tick[-1]) for site_log in site_logs]
-    final = _fix_delays(resolve_final_scenario(log), last_ticks, read_used_samples)
-    trace = RunTrace.of_log(log)
-    state = None
-    if _has_sampled_wall(final.scenario):
-        motions = [_SiteMotion(part.t_s, part.q, part.qd, part.theta_hat) for part in site_logs]
-        state = _find_state_in_wall(final.scenario, motions)
-    if state is None:
-        theta_hat = [site_log.theta_hat[-1] for site_log in site_logs]
-        state = _choose_end_state(final.scenario, trace, theta_hat)
-    loop = _build_end_loop(final, state, trace, own_laws=own_laws)
-    return loop._replace(programs=tuple(list_program_sites(log)))
-
-
-def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
-    """Finds the control loop at the end of a simulated run, and the nearest pose of rest.
-
-    The linear analysis of this loop shows whether the run is stable. The code of imported
-    control laws is executed.
-
-    Args:
-        scenario: The experiment.
-        run: Its run in the fused loop.
-
-    Raises:
-        ScenarioError: The loop cannot be linearised, or the run did not end near a pose of
-            rest.
-    """
-    if run.diverged_s is not None:
-        _check_mode(scenario.names[0], "diverged", scenario.name)
-    for i, name in enumerate(scenario.names):
-        mode = Mode(int(run.arrays(i).site[0]["mode"]))
-        _check_mode(name, mode.name.lower(), scenario.name)
-    ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
-    last_ticks = [ended.ticks(name) - 1 for name in ended.names]
-
-    def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
-        """Returns which messages (samples) of another arm were in use, by the delay model.
-
-        The function corresponds to `read_used_samples` of `find_log_loop`. A simulated run
-        without a log has no records, but the random delays of the link can be drawn again from
-        its seed. The drawn delays include the planned changes and outages of the link.
-
-        Args:
-            i: Index of the receiving site.
-            j: Index of the peer that sent the samples.
-            ticks: Ticks of the receiving site, shape (K,).
-
-        Returns:
-            Numbers of the samples, shape (K,). -1 before the first sample.
-        """
-        used = run.read_samples_in_use(i, last_ticks[i] + 1)
-        # A site is not its own peer, so the peers after it move up by one column.
-        samples: Ints = used[ticks, j - (j > i)]
-        return samples
-
-    final = _fix_delays(ended, last_ticks, draw_samples)
-    trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
-    state = None
-    if _has_sampled_wall(ended):
-        state = _find_state_in_wall(ended, _record_motions(ended))
-    if state is None:
-        theta_hat = []
-        for name, record in zip(ended.names, run.records, strict=True):
-            columns = ended.layout(name).columns()
-            theta_hat.append(record[columns["theta_hat"]])
-        state = _choose_end_state(ended, trace, theta_hat)
-    loop = _build_end_loop(final, state, trace, own_laws=True)
-    programs = [site for site in scenario.names if scenario.sites[site].has_program_hand]
-    return loop._replace(programs=tuple(programs))
 
 
 def _check_mode(site: str, mode: str, source: str) -> None:
@@ -270,8 +271,8 @@ def _check_mode(site: str, mode: str, source: str) -> None:
 def resolve_final_scenario(log: Log) -> Scenario:
     """Returns the scenario of a log, with the users' commands of the run as planned changes.
 
-    The duration of the scenario is the recorded duration. The settings in force at its end are
-    therefore those of the final control loop.
+    Its duration is the recorded duration. The settings in effect at its end are therefore those
+    of the final control loop.
 
     Args:
         log: The log of the run.
@@ -317,7 +318,7 @@ class _EndState(NamedTuple):
 
 def _build_end_loop(
     final: _FixedDelays, state: _EndState, trace: RunTrace, *, own_laws: bool
-) -> _EndLoop:
+) -> EndLoop:
     """Returns the control loop at the end of a run, with the nearest pose of rest.
 
     Args:
@@ -336,7 +337,7 @@ def _build_end_loop(
     rest = follow_equilibrium(final.scenario, settle_memories(conditions, end))
     last_q = _find_last_angles(final.scenario, trace)
     distance_rad = float(np.abs(last_q - rest.q).max())
-    return _EndLoop(
+    return EndLoop(
         scenario=final.scenario,
         conditions=conditions,
         rest=rest,
@@ -347,7 +348,7 @@ def _build_end_loop(
     )
 
 
-def _compute_roots(loop: _EndLoop) -> LoopRoots:
+def _compute_roots(loop: EndLoop) -> LoopRoots:
     """Computes the fastest growing (rightmost) roots of the loop at the end of a run.
 
     A root is the complex growth rate of a small motion. A stability certificate states these
@@ -359,11 +360,10 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
     if not loop.conditions.has_forms:
         sampled_loop = SampledLoop(loop.conditions, loop.uses)
         sampled = sampled_loop.compute_spectrum(loop.rest, _ROOTS)
-        laws = loop.scenario.controls
-        has_imported_law = any(isinstance(law, ImportedLaw) for law in laws)
         # Roots show growth, but may miss what happens beyond a threshold: in a user's law, or
         # when an arm touches a sampled wall again.
-        has_threshold = has_imported_law or _has_sampled_wall(loop.scenario)
+        has_user_law = bool(loop.scenario.user_laws)
+        has_threshold = has_user_law or _has_sampled_wall(loop.scenario)
         is_proof_possible = not has_threshold or sampled.verdict == "unstable"
         # A program that reacts to the arms may make a loop unstable, or stable.
         exact = sampled.is_exact and is_proof_possible and not loop.programs
@@ -374,7 +374,7 @@ def _compute_roots(loop: _EndLoop) -> LoopRoots:
         return roots._replace(
             distance_rad=loop.distance_rad,
             programs=loop.programs,
-            is_numerical=has_imported_law,
+            is_numerical=has_user_law,
             span_s=sampled.span_s,
             repeats=sampled.is_exact,
             deviation_per_s=sampled.deviation_per_s,
@@ -449,16 +449,14 @@ def _end_traces(scenario: Scenario) -> Scenario:
         scenario: The scenario up to the end of the run.
     """
     end_us = 1e6 * scenario.duration_s
-    links: dict[str, LinkBase] = dict(scenario.links)
-    timeline = list(scenario.timeline)
+    last_delays_ms = {}
     for name in scenario.links:
         link = find_final_link(scenario, name)
         points = link.points
         if not is_ending_trace(link) or points is None or not points[-1, 0] <= end_us:
             continue
-        links[name] = ConstantDelay(delay_ms=1e-3 * float(points[-1, 1]))
-        timeline = [change for change in timeline if change.link != name]
-    return msgspec.structs.replace(scenario, links=links, timeline=tuple(timeline))
+        last_delays_ms[name] = 1e-3 * float(points[-1, 1])
+    return scenario.with_constant_delays(last_delays_ms)
 
 
 def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
@@ -497,7 +495,6 @@ def _fix_delays(
     if not any(has_unknown_delay.values()):
         return _FixedDelays(scenario, None, {})
 
-    links: dict[str, LinkBase] = dict(scenario.links)
     rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
     common_hz = math.gcd(*rates_hz)
     # start and end of the last quarter, in ticks of the common rate
@@ -509,7 +506,7 @@ def _fix_delays(
 
     used = {}
     mean_age_s = {}
-    timeline = list(scenario.timeline)
+    delays_ms = {}
     for (i, site), (j, peer) in permutations(enumerate(scenario.names), 2):
         first_tick = start * rates_hz[i] // common_hz
         end_tick = end * rates_hz[i] // common_hz
@@ -525,13 +522,11 @@ def _fix_delays(
         if has_unknown_delay[name]:
             ages_s = ticks / rates_hz[i] - samples / rates_hz[j]
             mean_age_s[i, j] = float(ages_s.mean())
-            links[name] = ConstantDelay(delay_ms=1e3 * mean_age_s[i, j])
-            timeline = [change for change in timeline if change.link != name]
+            delays_ms[name] = 1e3 * mean_age_s[i, j]
 
     span_s = (end - start) / common_hz
     uses = SamplesInUse(span_s, used)
-    fixed_scenario = msgspec.structs.replace(scenario, links=links, timeline=tuple(timeline))
-    return _FixedDelays(fixed_scenario, uses, mean_age_s)
+    return _FixedDelays(scenario.with_constant_delays(delays_ms), uses, mean_age_s)
 
 
 def _choose_end_state(

@@ -1,8 +1,7 @@
-"""Linearises a control law that is known only by its code, by central differences.
+"""Linearises a control law that is known only from its code, using central differences.
 
 A user may write a control law as a Python function. Its derivatives are needed for the linear
-analysis, but its equations are unknown. For one tick (period of the control loop), the code is
-treated as a function:
+analysis, but its equations are unknown. For one tick, the code is treated as a function:
 
     (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque)
 
@@ -14,9 +13,9 @@ that it stores for the next tick. The arguments are:
 - `peers`, the states of these arms one by one,
 - `torque`, the external torque on the law's own arm.
 
-Each argument is changed by a small step in both directions, and the differences of the results
-give the derivatives. In continuous time, the memory changes at the rate m' = (m_k - m_{k-1}) /
-h, where h is the length of a tick.
+Each argument is changed by a small step in both directions, and the differences between the
+results give the derivatives. In continuous time, the memory changes at the rate m' = (m_k -
+m_{k-1}) / h, where h is the tick period.
 
 Invariant:
     - The law receives the same inputs as in a run. Its torque is not limited.
@@ -59,22 +58,22 @@ _STILL = 1e-14
 class NumericLaw:
     """A user's control law as a function that the linear analysis can differentiate.
 
-    The law may store values from one tick (period of the control loop) to the next. These
-    values are its memory. The law object is built once. A call of this object returns the law
-    object. It can therefore replace the function that normally builds the law of a `SiteSetup`.
+    The memory of the law consists of the values that it stores from one tick to the next. The
+    law object is built only once and returned by every call of this object, which can therefore
+    replace the function that normally builds the law of a `SiteSetup`.
 
     Args:
-        setup: Setup of the site, the process that runs the arm.
+        setup: Setup of the site.
         code: Name by which the scenario refers to the law.
-        shares: Dominance factors, the weights with which the site follows the other sites.
+        shares: Dominance factors of the site.
 
     Attributes:
         names: Names of the values in the memory, such as "error[1]".
         memory: The memory at the start of a run.
 
     Raises:
-        ScenarioError: The law sends vectors that it defines itself, or makes an end effector
-            follow.
+        ScenarioError: The law sends vectors that it defines itself, or follows with the end
+            effector.
     """
 
     def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
@@ -148,15 +147,15 @@ class NumericLaw:
     def complete_memory(self, memory: Array | None) -> Array:
         """Completes the memory of a control law if only its first values are known.
 
-        The memory contains all values that the law stores from tick to tick (period of the
-        control loop). Unknown values are taken from the memory at the start of a run.
+        The memory contains all values that the law stores from tick to tick. Unknown values are
+        taken from the memory at the start of a run.
 
         Args:
-            memory: Known values: the whole memory, or at least the values that the law itself
-                stores. Longer arrays are cut. `None` if nothing is known.
+            memory: Known values: the complete memory, or at least the values that the law
+                itself stores. Longer arrays are truncated. `None` if nothing is known.
 
         Returns:
-            The whole memory.
+            The complete memory.
         """
         full_memory: Array = self.memory.copy()
         if memory is None:
@@ -170,13 +169,12 @@ class NumericLaw:
     def iterate_memory(self, x: Array, ticks: int) -> Array:
         """Executes a user's control law with constant inputs until its memory is steady.
 
-        The memory consists of the values that the law stores from one tick (control period) to
-        the next, such as an integral. The iteration ends early once these values no longer
-        change.
+        The memory consists of the values that the law stores from one tick to the next, such as
+        an integral. The iteration ends early once these values no longer change.
 
         Args:
             x: Arguments in the order of `ArgumentLayout`, shape (arguments,).
-            ticks: Largest number of ticks.
+            ticks: Maximum number of ticks.
         """
         memory = self._memory_slice
         x = x.copy()
@@ -197,7 +195,7 @@ class NumericLaw:
         small change of the arguments.
 
         Args:
-            x: Arguments of the law, real with the shape (arguments,), or complex with the shape
+            x: Arguments of the law, real with shape (arguments,), or complex with shape
                 (arguments, columns).
 
         Returns:

@@ -1,16 +1,16 @@
 """Determines the delays, weights and operators with which the control loop is linearised.
 
 Delays, weights and operators may change during a run, but a linear loop has only one set of
-them, its operating point. The operating point consists of the values at the end of the run.
+them, its operating point. It consists of the values at the end of the run.
 
-The effective delay of a link is the age of the state that the receiver uses in a tick (period
-of its control loop). It may be longer than the network delay T, because a controller uses a
-state only at its next tick. With a constant delay and the same tick h at both ends, it is
-max(1, ceil(T / h)) ticks. Otherwise it is the mean over the same random delays as in a run.
+The effective delay of a link is the age of the state that the receiver uses at a tick. It may
+be longer than the network delay T, because a controller uses a state only at its next tick.
+With a constant delay and the same tick period h at both ends, it is max(1, ceil(T / h)) ticks.
+Otherwise it is the mean over the same random delays as in a run.
 
 Invariant:
     - A note reports every value that differed earlier in the run or that is random.
-    - An operating point that cannot be known before the run is refused.
+    - An operating point that cannot be known before the run is rejected.
 """
 
 import math
@@ -38,9 +38,8 @@ from ...core import (
 from ...errors import ScenarioError, count_nouns
 from ...files import find_page
 from ...laws import LinearForm, LinearSituation
-from ...own_code import ImportedLaw
 from ...records import NS_PER_S
-from ...scenario import LinkBase, Scenario, draw_used_samples
+from ...scenario import LinkBase, Scenario
 from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,
@@ -55,11 +54,12 @@ class Equilibrium(NamedTuple):
     """Pose in which all arms are at rest, about which their motion is linearised.
 
     Attributes:
-        q: Joint angles, shape (N, n), in rad. Rows of arms with fewer joints end in zeros.
+        q: Joint angles, shape (N, n), in rad. Rows of arms with fewer joints are padded with
+            zeros.
         theta_hat: Estimates of the arm parameters, shape (N, P), also padded with zeros. For a
-            law with known gravity they are the parameters that the law assumes, for an imported
-            law its memory.
-        how: A phrase that says how the equilibrium was determined.
+            law with known gravity, these are the parameters that the law assumes, and for an
+            imported law, its memory.
+        how: A phrase on how the equilibrium was determined.
         residual: Largest remaining acceleration, in rad/s^2, or rate of an estimate.
         notes: Remarks on the equilibrium.
     """
@@ -90,8 +90,8 @@ class _EffectiveDelay(NamedTuple):
     def varies(self) -> bool:
         """True if the age of the used samples is not constant.
 
-        Differences up to 10 ns do not count, because the times of ticks are whole nanoseconds,
-        and constant ages therefore differ a little.
+        Differences up to 10 ns are ignored: since tick times are rounded to nanoseconds, even
+        constant ages differ slightly.
         """
         return self.most_s > self.least_s + 1e-8
 
@@ -99,12 +99,12 @@ class _EffectiveDelay(NamedTuple):
 class OperatingConditions(NamedTuple):
     """Gains, delays, weights and operators from which the linear model of the arms is built.
 
-    The values are those at the end of a run of the scenario, see `OperatingConditions.derive`.
-    N is the number of arms (sites).
+    The values are those at the end of a run of the scenario (see `OperatingConditions.derive`).
+    N is the number of sites.
 
     Attributes:
         sites: Setups of the sites in scenario order, with the operators and environments in
-            force.
+            effect.
         alpha: Matrix of dominance factors, shape (N, N), Eq. (6). Entry (i, j) is the weight
             with which site i follows site j.
         age_s: Age of the sample of site j that site i uses, shape (N, N), in s. 0 if site i
@@ -112,7 +112,8 @@ class OperatingConditions(NamedTuple):
         notes: Remarks for the user on quantities that were left out or fixed.
         varying: True if ages vary during the run. `age_s` then contains their means.
         laws: Control law of each site.
-        links: The link from j to i in force, and the key of its random draws, by (i, j).
+        links: For each pair (i, j), the link from j to i in effect, and the key of its random
+            draws.
     """
 
     sites: tuple[SiteSetup, ...]
@@ -124,7 +125,7 @@ class OperatingConditions(NamedTuple):
     links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
-        """Returns the linear equations of control laws that gains alone do not describe.
+        """Returns the linear equations of control laws that are not described by gains alone.
 
         Examples are laws that store values from tick to tick, or send waves. `LinearForm`
         represents their equations.
@@ -134,8 +135,8 @@ class OperatingConditions(NamedTuple):
                 matrices.
 
         Returns:
-            The equations for each site (process that runs one arm). `None` for a site whose law
-            is fully described by its gains.
+            The equations for each site, or `None` for a site whose law is fully described by
+            its gains.
         """
         forms: list[LinearForm | None] = []
         for n, law in enumerate(self.laws):
@@ -154,9 +155,8 @@ class OperatingConditions(NamedTuple):
     def coupled_pairs(self) -> list[tuple[int, int]]:
         """Pairs (i, j) of sites for which site i reacts to the states that site j sends.
 
-        A site is a process that runs one arm. Site i reacts if its dominance factor for site j,
-        the weight with which it follows site j, is not zero. The control law of a user reads
-        the states of all other sites and therefore reacts in any case.
+        Site i reacts if its dominance factor for site j is not zero. A user's control law reads
+        the states of all other sites and therefore always reacts.
         """
         pairs = []
         for i, site in enumerate(self.sites):
@@ -169,28 +169,28 @@ class OperatingConditions(NamedTuple):
 
     @property
     def has_forms(self) -> bool:
-        """True if gains alone do not describe the control law of some arm.
+        """True if the control law of some arm is not described by gains alone.
 
-        Examples are laws that store values from tick to tick (control period), or send waves.
-        The coupled arms are then linearised in continuous time only, and not tick by tick.
+        Examples are laws that store values from tick to tick, or send waves. The coupled arms
+        are then linearised only in continuous time, and not tick by tick.
         """
         return any(form is not None for form in self.find_forms())
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the arms' sites (processes), in the order of the scenario."""
+        """Names of the sites, in scenario order."""
         return tuple(site.name for site in self.sites)
 
     @property
     def needs_sampled_loop(self) -> bool:
         """True if the controllers' ticks matter for stability and must therefore be modelled.
 
-        A tick is one period of the control loop. Ticks matter in three cases:
+        Ticks matter in three cases:
 
         - The integration scheme is `digital`: zero-order hold, as in a plain digital
           controller.
         - A wall or an operator acts once per tick.
-        - The delays vary in a known way, and not at random.
+        - The delays vary in a known way rather than at random.
         """
         has_random_link = any(link.random for link, _ in self.links.values())
         if self.varying and not has_random_link:
@@ -223,7 +223,7 @@ class OperatingConditions(NamedTuple):
         changes.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
             own_laws: True if the code of imported control laws may be executed.
 
         Raises:
@@ -290,16 +290,15 @@ def _describe_laws(scenario: Scenario) -> list[str]:
         scenario: The experiment.
     """
     notes = []
-    laws = scenario.controls
-    law_codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
-    for code in filter(None, dict.fromkeys(law_codes)):
-        pairs = zip(scenario.names, law_codes, strict=True)
-        sites = [name for name, law_code in pairs if law_code == code]
+    sites_by_code: dict[str, list[str]] = {}
+    for name, law in scenario.user_laws.items():
+        sites_by_code.setdefault(law.code, []).append(name)
+    for code, sites in sites_by_code.items():
         notes.append(
             f"{code} of {', '.join(sites)} is differentiated numerically, "
             "and so is its memory: by central differences"
         )
-    notes += [law.linear_note for law in laws if law.linear_note]
+    notes += [law.linear_note for law in scenario.controls if law.linear_note]
     return notes
 
 
@@ -324,8 +323,8 @@ def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> Si
     Returns:
         The setup with the law. The same setup if the law of the site is not imported.
     """
-    law = scenario.sites[site.name].control
-    if not isinstance(law, ImportedLaw):
+    law = scenario.user_laws.get(site.name)
+    if law is None:
         return site
     i = scenario.names.index(site.name)
     shares = np.delete(alpha[i], i).tolist()
@@ -347,10 +346,10 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
         law = spec.control
         theta = scenario.arms[name].theta
         gains = law.linear_gains(theta)
-        if own_laws and isinstance(law, ImportedLaw):
+        if own_laws and spec.user_law is not None:
             gains = law.gains(theta)
         if gains is None:
-            reason = _explain_missing_gains(law)
+            reason = _explain_missing_gains(scenario, name)
             raise ScenarioError(
                 f"has no linear loop: {reason}",
                 path=f"sites.{name}.control.law",
@@ -362,22 +361,26 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
     return gains_by_site
 
 
-def _explain_missing_gains(law: Any) -> str:
-    """Returns the reason why a control law cannot be linearised, as part of a sentence.
+def _explain_missing_gains(scenario: Scenario, site: str) -> str:
+    """Returns the reason why the control law of an arm cannot be linearised.
+
+    The reason is a part of a sentence.
 
     Args:
-        law: Settings of the control law.
+        scenario: The experiment.
+        site: Name of the site with the law.
     """
-    if isinstance(law, ImportedLaw):
+    spec = scenario.sites[site]
+    if spec.user_law is not None:
         return (
-            f"{law.code} is known by its code only, which may not run here; "
+            f"{spec.law_name} is known by its code only, which may not run here; "
             "trilat linear and trilat certify --law FILE run it"
         )
     others = (
         "adaptive, adaptive_box, p_d, pd_d, p_f and others have one, "
         f"see {find_page('laws.md')}"
     )
-    reason: str = law.explain_no_linear_form() or others
+    reason: str = spec.control.explain_no_linear_form() or others
     return reason
 
 
@@ -424,13 +427,13 @@ def compute_effective_delay(
     site: str,
     link: LinkBase,
 ) -> _EffectiveDelay:
-    """Computes how old the other arm's state is when a control loop uses it.
+    """Computes how old a peer's state is when a control loop uses it.
 
-    The ages are those in the run. If the delay repeats after a longer time than the run, the
-    ages in a whole period are used, because the loop is assumed to continue after the run.
+    The ages are those in the run. If the delay has a longer period than the run, the ages in a
+    full period are used, because the loop is assumed to continue after the run.
 
     Args:
-        scenario: The experiment.
+        scenario: The scenario.
         peer: Name of the sender.
         site: Name of the receiver.
         link: Delay model of the link between them.
@@ -459,8 +462,7 @@ def compute_effective_delay(
         # ages are complete when the samples of a whole period have arrived
         longest_s = 2e-3 * sum(link.moments())
         duration_s = max(duration_s, period_s + longest_s)
-    used_samples = draw_used_samples(
-        link=link,
+    used_samples = link.draw_used_samples(
         key=link_key(scenario.seed, f"{peer}->{site}"),
         receiver_hz=site_hz,
         sender_hz=peer_hz,
@@ -490,10 +492,10 @@ def has_lasting_delays(scenario: Scenario) -> bool:
 
     Delays do not remain constant if a sinusoid or a trace has other delays later. The ages of
     samples are compared, because a play-out buffer may hide varying delays. Random and measured
-    delays are ignored: only records show them.
+    delays are ignored, since only records show them.
 
     Args:
-        scenario: The experiment, with the duration of the run.
+        scenario: The scenario, with the duration of the run.
     """
     for i, j in permutations(range(len(scenario.names)), 2):
         if not scenario.alpha[i, j] and not scenario.timeline:

@@ -9,17 +9,17 @@ joint. `PortAnalysis.of_scenario` examines three properties:
 - Transparency: what an operator feels while another arm moves freely or is clamped.
 
 If end effectors follow each other instead of joints, the ports are at the end effectors, along
-the followed axes. The joint angles q are then replaced by x = J q and z = N' q. J is the
+the followed axes. The joint angles q are then replaced by x = J q and z = N' q, where J is the
 Jacobian of the followed axes at rest, and N a basis of the joint motions that leave these axes
 unchanged. A force F on the end effector acts as the joint torque J' F. Ports are numbered by
 their axis: 1 to 3 for the position, 4 to 6 for rotations.
 
 Invariant:
-    - Operators and environments are removed from the loop. Their torque at rest remains as a
-      constant. Therefore a held pose can be analysed too.
+    - Operators and environments are removed from the loop, but their torque at rest remains as
+      a constant, which makes it possible to analyse a held pose.
     - For an unstable loop only the instability is reported, because this loop has no steady
       oscillations.
-    - Every result holds for the analysed band of frequencies.
+    - Every result holds for the analysed frequency band.
 """
 
 from collections.abc import Mapping, Sequence
@@ -61,7 +61,7 @@ def freeze_external_torques(
 ) -> OperatingConditions:
     """Replaces operators and environments by the constant torque that they apply at rest.
 
-    The response of the arms then does not contain the stiffness and damping of operators.
+    The response of the arms then excludes the stiffness and damping of operators.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -81,10 +81,9 @@ def freeze_external_torques(
 
 
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Builds the linear model of the arms and their coupling, without operators and walls.
+    """Builds the linear model of the arms and their coupling, excluding operators and walls.
 
-    Operators and walls act at the joints, which are the ports of the model, and are not part of
-    the model.
+    Operators and walls act at the joints, which are the ports of the model.
 
     Args:
         conditions: The sites, gains and delays of the loop.
@@ -99,18 +98,18 @@ def build_proof_output(
 ) -> port_response.LoopOutput | None:
     """Returns the output of a loop with respect to which the paper proves passivity.
 
-    It is the filtered error r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)) of each
-    site i, Eq. (6), (9), (10). q are the joint angles, qd the velocities, Lambda is a gain,
-    alpha_ij the dominance factor with which site i follows site j, and T_ij the delay from j to
-    i. In task space it is J r with the Jacobian J, and positions take the place of q.
+    The output is the filtered error r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)) of
+    each site i, Eq. (6), (9), (10), where q are the joint angles, qd the velocities, Lambda a
+    gain, alpha_ij the dominance factor with which site i follows site j, and T_ij the delay
+    from j to i. In task space it is J r with the Jacobian J, and positions take the place of q.
 
     Args:
         conditions: The sites, gains and delays of the loop.
         loop: The linear model of the loop.
 
     Returns:
-        The output. `None` if there is no proof: for laws other than the paper's, for
-        orientations, and for axes that a peer does not follow.
+        The output, or `None` if there is no proof: for laws other than the paper's, for
+            orientations, and for axes that a peer does not follow.
     """
     sites = conditions.sites
     if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in sites):
@@ -144,16 +143,15 @@ def build_proof_output(
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
     """Computes the weights of the sites in the energy function of the stability proof.
 
-    A site is a process that runs one arm. The weight of site i is beta_i = pi_i / c_i. pi is
-    the left eigenvector of the matrix of dominance factors, the weights with which sites follow
-    each other. c_i is the gain of site i relative to gains that are common to all sites. The
+    The weight of site i is beta_i = pi_i / c_i, where pi is the left eigenvector of the matrix
+    of dominance factors, and c_i the gain of site i relative to gains common to all sites. The
     proof is in docs/theory/errata-proof.md.
 
     Args:
         conditions: The sites, gains and dominance factors.
 
     Returns:
-        The weights beta, shape (N,), for N sites. Their sum is N.
+        The weights beta, shape (N,), for N sites. They sum to N.
     """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
     for site_Kd, site in zip(Kd, conditions.sites, strict=True):
@@ -163,7 +161,7 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
     return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
 
-class TwoPort(NamedTuple):
+class _TwoPort(NamedTuple):
     """Result of Llewellyn's stability criterion for one joint of two arms.
 
     The criterion says whether the arms are stable with every passive operator or wall at both
@@ -190,26 +188,26 @@ class PortAnalysis(NamedTuple):
     environment touches an arm, such as a joint.
 
     Attributes:
-        scenario: The teleoperator.
+        scenario: The scenario of the coupled arms.
         band_hz: Lower and upper end of the analysed band, in Hz.
         resolved_hz: Frequency up to which the grid resolves the phase of the delays, in Hz.
         verdict: Verdict of the loop's characteristic roots: "stable", "unstable" or "at the
             edge".
         pole: Pole of the admittance at zero frequency.
         velocity: Passivity at all ports with respect to the velocities.
-        joints: Passivity at each joint by itself, without operators at the other joints, by
-            number of the joint.
-        proof: Passivity with respect to r = qd + Lambda e. `None` if the law has no r.
-        beta: Weights of the sites in `proof`, shape (N,), with the sum N.
+        joints: Passivity at each single joint, without operators at the other joints, keyed by
+            joint number.
+        proof: Passivity with respect to r = qd + Lambda e, or `None` if the law has no r.
+        beta: Weights of the sites in `proof`, shape (N,), which sum to N.
         estimates_true: True if all estimates at the equilibrium are true. Otherwise the proof
             counts the energy that they store, which a linear loop cannot show.
-        absolute: Least eigenvalue over frequency under the best weights. If it is never
+        absolute: Smallest eigenvalue over frequency with the best weights. If it is never
             negative, the loop is stable with any passive operators.
         two_ports: Llewellyn's criterion for every pair of sites.
         transparency: Transparency at each site, with one other site free and clamped.
         clamped_verdict: Verdict of the roots with this other site clamped.
-        axes: Name of the axis in task space, by port number. Empty in joint space.
-        measured: Result with measured operators at the masters, see `check_against_hands`.
+        axes: Name of the axis in task space, keyed by port number. Empty in joint space.
+        measured: Result with measured operators at the masters (see `check_against_hands`), or
             `None` if no operator was measured.
     """
 
@@ -224,7 +222,7 @@ class PortAnalysis(NamedTuple):
     beta: Array
     estimates_true: bool
     absolute: frequency_search.Minima
-    two_ports: tuple[TwoPort, ...]
+    two_ports: tuple[_TwoPort, ...]
     transparency: tuple[Transparency, ...]
     clamped_verdict: str
     axes: Mapping[int, str] = MappingProxyType({})
@@ -232,24 +230,34 @@ class PortAnalysis(NamedTuple):
 
     @property
     def sites(self) -> tuple[str, ...]:
-        """Names of the sites, the processes that each control one arm."""
+        """Names of the sites."""
         return self.scenario.names
 
     @property
     def kind(self) -> str:
-        """Word for the place where an operator pushes an arm: "joint", or "axis" in task space.
-
-        In task space, arms follow each other with their end effectors (tips).
-        """
+        """The place where an operator pushes an arm: "joint", or "axis" in task space."""
         return "axis" if self.axes else "joint"
 
     @property
     def speed(self) -> str:
-        """Symbol of the velocity at a port, the place where an operator pushes, for figures.
-
-        It is "qd" for joints, and "xd" if end effectors follow each other.
-        """
+        """Symbol of the velocity at a port, for figures: "qd", or "xd" in task space."""
         return "xd" if self.axes else "qd"
+
+    def group_failing_two_ports(self, *, by_joint: bool) -> list[list[_TwoPort]]:
+        """Groups the two-ports for which Llewellyn's criterion fails.
+
+        The two-ports of a group have the same sites, and the same third site clamped (or none).
+
+        Args:
+            by_joint: True to also separate the joints.
+        """
+        groups: dict[tuple[object, ...], list[_TwoPort]] = {}
+        for two_port in self.two_ports:
+            if two_port.minima.below:
+                joint = two_port.joint if by_joint else ""
+                key = (two_port.sites, two_port.clamped, joint)
+                groups.setdefault(key, []).append(two_port)
+        return list(groups.values())
 
     def name_port(self, number: int) -> str:
         """Returns a name for the user of the joint or axis at which an operator pushes an arm.
@@ -257,19 +265,19 @@ class PortAnalysis(NamedTuple):
         Examples are "joint 2" and "axis y".
 
         Args:
-            number: Number of the joint, or of the axis of the end effector if end effectors
-                follow each other, from 1.
+            number: Number of the joint, or in task space of the axis of the end effector, from
+                1.
         """
         return f"{self.kind} {self.axes.get(number, number)}"
 
     def impedance_unit(self, number: int = 0) -> str:
         """Returns the unit of the impedance that an operator feels, for tables and figures.
 
-        For a joint, it is N m s/rad.
+        For a joint, this is N m s/rad.
 
         Args:
-            number: Number of a joint, or of an axis of the end effector if end effectors follow
-                each other, from 1. 0 stands for all joints or axes together.
+            number: Number of a joint, or in task space of an axis of the end effector, from 1.
+                0 stands for all joints or axes together.
         """
         linear = "N s/m"
         angular = "N m s/rad"
@@ -292,15 +300,15 @@ class PortAnalysis(NamedTuple):
     ) -> "PortAnalysis":
         """Analyses what operators feel when they hold arms, and whether the arms are passive.
 
-        The coupled arms are linearised about a pose of rest. Their response to torques on the
-        joints is computed over a band of frequencies.
+        The coupled arms are linearised about an equilibrium. Their response to torques at the
+        joints is computed over a frequency band.
 
         Args:
-            scenario: Description of the coupled arms.
-            rest: The pose of rest.
-            of: Site (process that runs one arm) whose arm is once free and once clamped, while
-                operators feel the other arms. If `None`, the slave is used, or the last site if
-                there is no slave.
+            scenario: Scenario of the coupled arms.
+            rest: The equilibrium.
+            of: Site whose arm is free in one case and clamped in the other, while operators
+                feel the other arms. If `None`, the slave is used, or the last site if there is
+                no slave.
             band_hz: Lower and upper end of the band, in Hz.
             hands: Measured impedances of operators. Any of them may hold the arm of any master.
 
@@ -323,7 +331,7 @@ class PortAnalysis(NamedTuple):
         other_site = of or scenario.slave
 
         sites = port_response.list_port_sites(loop)
-        delay_s = port_response.find_longest_delay_s(loop)
+        delay_s = loop.longest_delay_s
         grid = frequency_search.build_frequency_grid(low, high, delay_s)
         Y = port_response.build_admittance(loop)
         w_rad_s = frequency_search.refine_frequencies(Y, grid)
@@ -364,7 +372,7 @@ class PortAnalysis(NamedTuple):
     def to_json(self) -> dict[str, Any]:
         """Converts an analysis of what operators feel to plain values for JSON.
 
-        Infinite numbers become `None`, because JSON has no representation for them.
+        Infinite values become `None`, because JSON cannot represent them.
         """
         measured = self.measured
         return {
@@ -540,7 +548,7 @@ def _check_two_ports(
     loop: LinearLoop,
     Y: port_response.PortResponse,
     w_rad_s: Array,
-) -> tuple[TwoPort, ...]:
+) -> tuple[_TwoPort, ...]:
     """Checks for every pair of arms whether they are stable with every passive user and wall.
 
     Llewellyn's criterion is evaluated at each joint that both arms have. With three arms, the
@@ -559,7 +567,7 @@ def _check_two_ports(
                 pair_ports = [port for port in ports if site_of_port[port] in pair]
                 if len(pair_ports) == len(pair):
                     minima = _check_llewellyn(Y, pair_ports, clamped_ports, w_rad_s)
-                    two_ports.append(TwoPort(pair, joint, clamped, minima))
+                    two_ports.append(_TwoPort(pair, joint, clamped, minima))
     return tuple(two_ports)
 
 

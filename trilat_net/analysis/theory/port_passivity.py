@@ -1,16 +1,16 @@
 """Checks whether coupled arms stay stable with every passive operator, at any frequency.
 
-A passive operator is a person or object that cannot supply energy on balance. A place where an
+A passive operator is a person or object that cannot supply net energy. A place where an
 operator touches an arm is called a port. The admittance Y of the ports is the matrix that maps
 the torques u of the operators to the velocities of the ports at one frequency. The torques
 supply the mean power 1/4 u^H (Y + Y^H) u to the arms, where ^H is the conjugate transpose.
 
-There are two conditions for a stable control loop:
+For a stable control loop, there are two conditions:
 
 - The loop is passive if Y + Y^H has no negative eigenvalue at any frequency. It is then stable
-  with every passive environment, also with operators who are coupled to each other.
+  with every passive environment, even with operators who are coupled to each other.
 - The loop is absolutely stable, that is, stable with independent passive operators, under a
-  weaker condition. At each frequency there is a diagonal matrix D of positive weights for which
+  weaker condition: at each frequency there is a diagonal matrix D of positive weights for which
   D Y + Y^H D has no negative eigenvalue. D has one weight per arm.
 
 Sources:
@@ -33,14 +33,17 @@ Invariant:
       necessary for up to three arms.
 """
 
+import json
 from collections.abc import Sequence
 from itertools import product
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Array
+from ...errors import UsageError
 from .characteristic_roots import Complex
 from .frequency_search import Minima
 from .port_response import PortResponse
@@ -64,16 +67,16 @@ _WEIGHT_TOLERANCE = 1e-3
 class Passivity(NamedTuple):
     """Whether coupled arms are passive: they never supply net energy to their operators.
 
-    Y is the admittance over frequency: the velocities at the operators' joints per torque. The
-    arms are passive if Y + Y^H has no negative eigenvalue, where Y^H is the conjugate
+    Y is the admittance over frequency: the velocity at the operators' joints per unit torque.
+    The arms are passive if Y + Y^H has no negative eigenvalue, where Y^H is the conjugate
     transpose.
 
     Attributes:
-        minima: Least eigenvalue of Y + Y^H over frequency, in rad/s per N m, and the bands in
-            which it is negative.
+        minima: Smallest eigenvalue of Y + Y^H over frequency, in rad/s per N m, and the bands
+            in which it is negative.
         size: Largest singular value of Y at these frequencies, shape (F,), in rad/s per N m.
             The eigenvalues of Y + Y^H lie within twice this value.
-        lacking_nm_s_rad: Damping that would make the loop passive if each port had it, in N m
+        lacking_nm_s_rad: Damping that, added at each port, would make the loop passive, in N m
             s/rad. Infinite if it grows without bound towards the lowest frequencies.
     """
 
@@ -104,20 +107,20 @@ class Passivity(NamedTuple):
 
         Args:
             response: Function that returns the response at given frequencies: usually the
-                admittance, the velocities at the p ports per torque. Another output with p
-                entries is allowed too.
-            w_rad_s: First frequencies, rising, shape (F,), in rad/s.
-            weights: Positive weights of the ports, shape (p,). `None` if all are 1. In this
-                case the examined sum of torque times output is a physical power, if the outputs
-                are velocities.
+                admittance (velocity at the p ports per unit torque). Another output with p
+                entries is also allowed.
+            w_rad_s: Initial frequencies in ascending order, shape (F,), in rad/s.
+            weights: Positive weights of the ports, shape (p,), or `None` if all are 1. With
+                unit weights and velocity outputs, the examined sum of torque times output is
+                the physical power.
 
         Returns:
-            The least eigenvalue over frequency, which determines passivity, and related
-            numbers.
+            The smallest eigenvalue over frequency, which determines passivity, and related
+            quantities.
         """
 
         def evaluate_weighted(w: Array) -> Complex:
-            """Returns the frequency response, with the weights of the ports if any."""
+            """Returns the frequency response, scaled with the port weights, if any."""
             Y = response(w)
             return Y if weights is None else weight_response(Y, weights)
 
@@ -126,7 +129,7 @@ class Passivity(NamedTuple):
             return find_least_eigenvalue(weighted)
 
         def find_tolerance(w: Array) -> Array:
-            """Returns the rounding error of the least eigenvalue at each w, in rad/s."""
+            """Returns the rounding error of the smallest eigenvalue at each w, in rad/s."""
             Y = response(w)
             norm = _find_frobenius_norm(Y)
             return EIGENVALUE_ROUNDING * norm
@@ -141,11 +144,15 @@ class Passivity(NamedTuple):
         return cls(minima, size, lacking)
 
 
+_HAND_KEYS = ("mass_kg", "damping_n_s_m", "stiffness_n_m")
+"""Keys of the mass, damping and stiffness matrix in the file of a measured hand."""
+
+
 class HandMatrices(NamedTuple):
     """Measured impedance of an operator who holds the end effector.
 
-    The operator resists a motion with the force F = -(M a + B v + K x), with the position x,
-    the velocity v and the acceleration a of the end effector.
+    The operator resists a motion with the force F = -(M a + B v + K x), where x is the position
+    of the end effector, v its velocity and a its acceleration.
 
     Attributes:
         M: Mass, shape (n, n), in kg.
@@ -157,11 +164,43 @@ class HandMatrices(NamedTuple):
     B: Array
     K: Array
 
+    @classmethod
+    def read(cls, file: Path) -> "HandMatrices":
+        """Reads the measured mass, damping and stiffness of a person's hand from a JSON file.
+
+        Stability can then be checked against this hand instead of every passive operator, which
+        is a less strict condition.
+
+        Args:
+            file: Path of a file that `trilat identify hand --json` wrote.
+
+        Raises:
+            UsageError: The file does not contain the dynamics of a hand.
+        """
+        try:
+            values = json.loads(file.read_text(encoding="utf-8"))
+            M, B, K = (np.array(values[key], dtype=np.float64) for key in _HAND_KEYS)
+            have_same_shape = M.shape == B.shape == K.shape
+            if not have_same_shape or M.shape not in ((2, 2), (3, 3)):
+                raise ValueError("the matrices must all have 2 rows and columns, or all have 3")
+            if not np.isfinite([M, B, K]).all():
+                raise ValueError("a number is not finite")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            problem = str(error)
+            # The text of a KeyError is only the key.
+            if isinstance(error, KeyError):
+                problem = f"the key {error} is missing"
+            raise UsageError(
+                f"{file}: does not contain the output of `trilat identify hand --json`: "
+                f"{problem}"
+            ) from None
+        return cls(M, B, K)
+
     def compute_resistance(self, w_rad_s: Array) -> Complex:
         """Returns the resistive part of a human hand's impedance, shape (F, n, n), in N s/m.
 
-        It is the Hermitian part of Z(j w) = j w M + B + K / (j w), with the mass M, the damping
-        B and the stiffness K.
+        This is the Hermitian part of Z(j w) = j w M + B + K / (j w), with the mass M, the
+        damping B and the stiffness K.
 
         Args:
             w_rad_s: Frequencies w, shape (F,), in rad/s.
@@ -193,30 +232,30 @@ def check_against_hands(
     held: Sequence[Sequence[HandMatrices]],
     places: Sequence[Array],
 ) -> Minima | None:
-    """Checks the stability if any of the measured operators may hold any end effector.
+    """Checks whether the loop is stable if any of the measured operators hold any end effector.
 
-    The result is the least eigenvalue of Z + Z^H + 2 D over every choice of operators, where Z
-    = Y^-1, and D is the resistance of the operators at the ports. If the eigenvalue is not
-    negative at any frequency, Z together with D is passive, and each operator without D is
-    passive too. The loop is then stable with any of these operators, and with passive
-    environments at the other ports. Like passivity, this condition is sufficient.
+    The result is the smallest eigenvalue of Z + Z^H + 2 D over every choice of operators, where
+    Z = Y^-1, and D is the resistance of the operators at the ports. If the eigenvalue is not
+    negative at any frequency, Z together with D is passive, and each operator without D is also
+    passive. The loop is then stable with any of these operators, and with passive environments
+    at the other ports. Like passivity, this condition is sufficient.
 
     Args:
         response: Admittance Y at the ports.
-        w_rad_s: Frequencies, rising, shape (F,), in rad/s.
+        w_rad_s: Frequencies in ascending order, shape (F,), in rad/s.
         held: For each end effector that is held, the operators who may hold it.
-        places: For each of these end effectors, the matrix from the velocities at all ports to
-            its own velocity, shape (n, p).
+        places: For each of these end effectors, the matrix that maps the velocities at all
+            ports to its own velocity, shape (n, p).
 
     Returns:
-        The least eigenvalue over frequency, in N m s/rad or N s/m. `None` if no operator is
-        known.
+        The smallest eigenvalue over frequency, in N m s/rad or N s/m, or `None` if no operator
+        is known.
     """
     if not held:
         return None
 
     def find_least(w: Array) -> Array:
-        """Returns the least eigenvalue of Z + Z^H + 2 D over all choices of operators."""
+        """Returns the smallest eigenvalue of Z + Z^H + 2 D over all choices of operators."""
         Y = response(w)
         Z = np.linalg.inv(Y).astype(np.complex128)
         Z += _conjugate_transpose(Z)
@@ -239,7 +278,7 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of the least eigenvalue at each w, in rad/s."""
+        """Returns the rounding error of the smallest eigenvalue at each w, in rad/s."""
         Y = response(w)
         Z: Complex = np.linalg.inv(Y).astype(np.complex128)
         norm = _find_frobenius_norm(Z)
@@ -249,7 +288,7 @@ def check_against_hands(
 
 
 def weight_response(Y: Complex, weights: Array) -> Complex:
-    """Multiplies a frequency response by weights, so that its passivity is judged with them.
+    """Scales a frequency response with port weights, for checking weighted passivity.
 
     The result is D^1/2 Y D^-1/2 with D = diag(weights). The eigenvalues of its Hermitian part
     have the same signs as those of D Y + Y^H D.
@@ -268,16 +307,14 @@ def weight_response(Y: Complex, weights: Array) -> Complex:
 
 
 def find_least_eigenvalue(Y: Complex) -> Array:
-    """Returns the least eigenvalue of Y + Y^H at each frequency.
+    """Returns the smallest eigenvalue of Y + Y^H at each frequency, shape (F,).
 
-    Here Y is the admittance, from torques to velocities, and Y^H its conjugate transpose. The
-    arms are passive if the value is never negative: they never supply energy to operators.
+    Y is the admittance, which maps torques to velocities, and Y^H its conjugate transpose. If
+    the eigenvalue is never negative, the arms are passive: they never supply energy to
+    operators.
 
     Args:
         Y: Response, shape (F, p, p).
-
-    Returns:
-        Eigenvalues, shape (F,).
     """
     hermitian_sum = Y + _conjugate_transpose(Y)
     eigenvalues = np.linalg.eigvalsh(hermitian_sum)
@@ -321,8 +358,8 @@ def llewellyn_parameter(Y: Complex) -> Array:
     """Returns Llewellyn's parameter of two scalar ports, shape (F,).
 
     The parameter is (2 Re y11 Re y22 - Re(y12 y21)) / abs(y12 y21). The criterion of absolute
-    stability requires at least 1. The parameter is limited to `MAX_LLEWELLYN`, the value of two
-    ports without transmission, and to -1 if Re y11 or Re y22 is negative.
+    stability requires at least 1. The parameter is at most `MAX_LLEWELLYN`, the value for two
+    ports without transmission, and at most -1 if Re y11 or Re y22 is negative.
 
     Args:
         Y: Admittance, shape (F, 2, 2).
@@ -351,16 +388,13 @@ def llewellyn_parameter(Y: Complex) -> Array:
 
 
 def llewellyn_rounding(Y: Complex) -> Array:
-    """Returns the rounding error of Llewellyn's stability parameter at each frequency.
+    """Returns the rounding error of Llewellyn's stability parameter, shape (F,).
 
-    If the parameter is closer to the limit than this error, the criterion does not decide. The
-    error is large if almost nothing is transmitted from one joint to the other.
+    If the distance of the parameter from its limit is less than this error, the criterion does
+    not decide. The error is large if almost nothing is transmitted from one joint to the other.
 
     Args:
         Y: Admittance, shape (F, 2, 2).
-
-    Returns:
-        Error, shape (F,).
     """
     y12 = Y[:, 0, 1]
     y21 = Y[:, 1, 0]
@@ -375,7 +409,7 @@ def llewellyn_rounding(Y: Complex) -> Array:
 def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
     """Returns the admittance at some joints while other joints are clamped.
 
-    The admittance is the velocity per torque, and a clamp holds the velocity at zero. The
+    The admittance is the velocity per unit torque, and a clamp holds the velocity at zero. The
     result is a Schur complement. Joints in neither list move freely.
 
     Args:
@@ -418,19 +452,21 @@ class _BestWeights(NamedTuple):
 def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> _BestWeights:
     """Finds the site weights that best prove absolute stability, at each frequency.
 
-    Each site (process that runs one arm) has one positive weight, which belongs to all its
-    ports (places where operators act). D is the diagonal matrix of these weights. The loop is
-    stable with any passive operators if the matrix H = D^1/2 Y D^-1/2 + (D^1/2 Y D^-1/2)^H has
-    no negative eigenvalue, where ^H is the conjugate transpose. The least eigenvalue of H is
-    concave in ln D (compare Sezginer and Overton, IEEE Trans. Automatic Control 35 (1990)). The
-    ellipsoid method therefore finds its maximum.
+    Each site has one positive weight, shared by all its ports (places where operators act). D
+    is the diagonal matrix of these weights. The loop is stable with any passive operators if
+    the matrix H = D^1/2 Y D^-1/2 + (D^1/2 Y D^-1/2)^H has no negative eigenvalue, where ^H is
+    the conjugate transpose. The smallest eigenvalue of H is concave in ln D (compare Sezginer
+    and Overton, IEEE Trans. Automatic Control 35 (1990)), which lets the ellipsoid method find
+    its maximum.
 
     Args:
-        Y: Admittance (velocity per torque) of the p ports at F frequencies, shape (F, p, p).
+        Y: Admittance (velocity per unit torque) of the p ports at F frequencies, shape (F, p,
+            p).
         owner: Index of the site of each port, shape (p,).
 
     Returns:
-        The largest least eigenvalue at each frequency, and the weights that give it.
+        The maximum of the smallest eigenvalue at each frequency, and the weights that attain
+        it.
     """
     scaled = _scale_sites(Y, owner)
     frequencies = len(Y)

@@ -1,14 +1,14 @@
 """Computes how coupled arms respond to an operator's torque at each frequency.
 
 An operator touches an arm at a haptic port, for example a joint. The admittance of the port is
-the velocity of the joint per torque of the operator, as a function of frequency. The impedance
-is its inverse. Both are computed from the linear model of all arms.
+the joint velocity per unit torque of the operator, as a function of frequency. The impedance is
+its inverse. Both are computed from the linear model of all arms.
 
-Transparency is how well an operator feels what happens at another arm. It is judged by the
-impedance at one joint of the operator's arm, in N m s/rad, once while the other arm is free and
-once while it is clamped. The operator applies no torque to the other joints. A large difference
-means that the operator can distinguish free space from a rigid object. Means over a band of
-frequencies are taken on a logarithmic axis, so that each decade has the same weight.
+Transparency is how well an operator feels what happens at another arm. It is judged from the
+impedance at one joint of the operator's arm, in N m s/rad, computed with the other arm free and
+with the other arm clamped. The operator applies no torque to the other joints. A large
+difference means that the operator can distinguish free space from a rigid object. Means over a
+frequency band are taken on a logarithmic axis, which weights each decade equally.
 
 Sources:
     - Impedance and admittance: Hogan, "Impedance control: an approach to manipulation", ASME J.
@@ -17,7 +17,7 @@ Sources:
       kinesthetic feedback", IEEE Trans. Robotics and Automation 5 (1989).
     - Transmitted impedance: Lawrence, "Stability and transparency in bilateral teleoperation",
       IEEE Trans. Robotics and Automation 9 (1993).
-    - The difference of the free and the clamped impedance (Z-width): Hashtrudi-Zaad and
+    - The difference between the free and the clamped impedance (Z-width): Hashtrudi-Zaad and
       Salcudean, "Analysis and evaluation of stability and performance robustness for
       teleoperation control architectures", ICRA (2000). The ratio of the two impedances is our
       own measure (docs/studies/ports.md).
@@ -59,13 +59,13 @@ _NEGLIGIBLE = 1e-3
 
 
 class LoopOutput(NamedTuple):
-    """Output of a linear loop that depends on its present and its delayed states x.
+    """Output of a linear loop as a function of its present and its delayed states x.
 
-    It is y(t) = C x(t) + sum_k C_k x(t - T_k).
+    The output is y(t) = C x(t) + sum_k C_k x(t - T_k).
 
     Attributes:
         C: Matrix of the present state, shape (p, n).
-        delayed: Pairs of a delay T_k, in s, and the matrix C_k, shape (p, n).
+        delayed: Pairs of a delay T_k, in s, and its matrix C_k, shape (p, n).
     """
 
     C: Array
@@ -74,7 +74,7 @@ class LoopOutput(NamedTuple):
     def evaluate(self, s: Complex) -> Complex:
         """Returns the matrix from the state of the arms to an output at complex frequencies s.
 
-        It is C + sum_k C_k e^{-s T_k}, with the network delays T_k.
+        The matrix is C + sum_k C_k e^{-s T_k}, with the network delays T_k.
 
         Args:
             s: Complex frequencies, shape (F,), in 1/s.
@@ -106,9 +106,9 @@ def _evaluate_shift(s: Complex, delay_s: float) -> Complex:
 class PoleAtZero(NamedTuple):
     """Response of coupled arms to constant torques, which may make velocities grow.
 
-    The response Y(s) gives p velocities per torque, for m torques. A pole at s = 0 means that a
-    constant torque makes a velocity grow, as for a mass without friction. Near s = 0 the
-    response is then about residue / s, and higher powers of 1 / s may be added.
+    The response Y(s) gives p velocities per unit torque, for m torques. A pole at s = 0 means
+    that a constant torque makes a velocity grow, as for a mass without friction. Near s = 0 the
+    response is then approximately residue / s, possibly with additional higher powers of 1 / s.
 
     Attributes:
         order: Highest power of 1 / s. If the order is 0, there is no pole, and velocities under
@@ -124,7 +124,7 @@ class PoleAtZero(NamedTuple):
         """True if the response at zero frequency is compatible with a passive system.
 
         A passive system never supplies more energy than it received. If its response has a pole
-        at zero, the pole is simple. Its residue is a symmetric matrix without negative
+        at zero, the pole is simple, and its residue is a symmetric matrix without negative
         eigenvalues.
         """
         residue = self.residue
@@ -142,11 +142,11 @@ class PoleAtZero(NamedTuple):
     def of_loop(cls, loop: LinearLoop) -> "PoleAtZero":
         """Finds whether constant torques make the velocities of coupled arms grow.
 
-        The velocities grow if the response Y(s), velocity per torque, has a pole at zero. For
-        example, a free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not
-        sufficient. The arms have many of these roots, because they can rest in several poses,
-        and a resting arm has no velocity. The pole is found by Cauchy's integral along a small
-        circle around zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
+        The velocities grow if the response Y(s), velocity per unit torque, has a pole at zero.
+        For example, a free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is
+        not sufficient: the arms have many of these roots, because they can rest in several
+        poses, and an arm at rest has no velocity. The pole is found with Cauchy's integral
+        along a small circle around zero, with the radius `ZERO_ROOT_RADIUS_PER_S`.
 
         Args:
             loop: Linear model of the coupled arms.
@@ -200,8 +200,7 @@ def evaluate_transfer(
             and the result is the admittance, in rad/s per N m.
 
     Returns:
-        The response, shape (F, p, m), with a row for each of p outputs and a column for each of
-        m torques.
+        The response, shape (F, p, m), with one row per output and one column per torque.
     """
     output = LoopOutput(loop.C) if output is None else output
     count = len(s)
@@ -231,12 +230,12 @@ def evaluate_transfer(
 def build_admittance(loop: LinearLoop) -> PortResponse:
     """Returns the admittance Y(j w) of a loop as a function of the frequency w in rad/s.
 
-    The admittance is the velocity of each joint per torque of an operator at each joint, in
-    rad/s per N m.
+    The admittance is the velocity of each joint per unit torque of an operator at each joint,
+    in rad/s per N m.
 
     Args:
-        loop: The loop. Its outputs must be the velocities of the joints of its inputs, in
-            order.
+        loop: The loop. Its outputs must be the velocities of the joints of its inputs, in the
+            same order.
     """
     velocities = loop.C.shape[0]
     torques = loop.B.shape[1]
@@ -265,10 +264,10 @@ def to_imaginary_axis(w_rad_s: Array) -> Complex:
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the site (arm) in the name of a port or state, for example "m1" for "m1.tau2".
+    """Returns the site in the name of a port or state, for example "m1" for "m1.tau2".
 
     Args:
-        port: Name of the input or state of a linear model.
+        port: Name of an input or state of a linear model.
     """
     return port.partition(".")[0]
 
@@ -276,8 +275,8 @@ def parse_port_site(port: str) -> str:
 def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
     """Returns the names of the sites whose joints have inputs in a linear model.
 
-    A site is a process that runs one arm. The inputs are torques on joints, such as "m1.tau1"
-    for site m1. Each site is listed once, in the order of its first input.
+    The inputs are joint torques, such as "m1.tau1" for site m1. Each site is listed once, in
+    the order of its first input.
 
     Args:
         loop: Linear model of the coupled arms.
@@ -290,14 +289,14 @@ def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
 def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
     """Finds the ports of an arm, the joints at which its operator pushes.
 
-    In the linear model of all arms, each port is an input.
+    Each port is an input of the linear model of all arms.
 
     Args:
         loop: The loop.
         site: Name of the site.
 
     Returns:
-        Indices of the ports in the loop's inputs.
+        Indices of the ports among the inputs of the loop.
 
     Raises:
         UsageError: The loop has no such site.
@@ -325,16 +324,16 @@ def _parse_port_joint(port: str) -> int:
 
 
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
-    """Groups the inputs of a linear model by their joint, in the order of the sites.
+    """Groups the inputs of a linear model by joint, in the order of the sites.
 
-    For example, the first joints of all arms can then be analysed together, without the other
-    joints.
+    The first joints of all arms, for example, can then be analysed together, excluding the
+    other joints.
 
     Args:
         loop: The loop.
 
     Returns:
-        Indices of the ports, by the number of the joint.
+        A mapping from joint number to port indices.
     """
     ports: dict[int, list[int]] = {}
     for port, name in enumerate(loop.inputs):
@@ -347,7 +346,7 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
     """Restricts a frequency response to some joints, at which operators act.
 
     No operator acts at the other joints. Their torque is zero, and their rows and columns are
-    left out.
+    removed.
 
     Args:
         response: The response at all ports, as a function of frequency.
@@ -361,29 +360,20 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
     return evaluate_selected
 
 
-def find_longest_delay_s(loop: LinearLoop) -> float:
-    """Returns the longest delay of any network link or signal in a linear loop, in s.
-
-    The result is 0 for a loop without delays.
-    """
-    delays_s = [term.delay_s for term in loop.delayed]
-    return max(delays_s, default=0.0)
-
-
 def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     """Returns the linear model of the arms with one arm held still by a clamp.
 
     The torque u_c of the clamp makes the arm's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
-    u + delayed terms). Here x is the state, u the other torques, A_c and B_c are the rows of
-    the loop's matrices for these accelerations, and B_cc is the part of B_c that belongs to the
-    arm's own torques. The torque acts wherever the law uses the torque of this arm.
+    u + delayed terms), where x is the state, u the other torques, A_c and B_c the rows of the
+    loop's matrices for these accelerations, and B_cc the part of B_c that belongs to the arm's
+    own torques. The torque acts wherever the law uses the torque of this arm.
 
     Args:
         loop: The loop.
         site: Name of the site.
 
     Returns:
-        The loop without the ports, velocities and angles of the site.
+        The loop excluding the ports, velocities and angles of the site.
 
     Raises:
         UsageError: There is no such site, or two clamped sites reflect force onto each other.
@@ -417,7 +407,7 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     def add_term(delay_s: float, A: Array, B: Array) -> None:
         """Adds matrices to the part of the model that acts after a given delay.
 
-        Delays that differ only by rounding errors count as equal.
+        Delays that differ only by rounding errors are considered equal.
 
         Args:
             delay_s: The delay, in s.
@@ -485,7 +475,7 @@ _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """How much of another arm an operator feels: the impedances with this arm free and clamped.
+    """How much of another arm an operator feels: the impedance with this arm free and clamped.
 
     A transparent system feels light while the other arm is free, and stiff while the other arm
     is clamped.
@@ -513,8 +503,8 @@ class Transparency(NamedTuple):
         """Mean impedance that the operator feels while the other arm is free, in N m s/rad.
 
         The smaller this mean is, the less the operator feels of the arms themselves. It is the
-        geometric mean of the impedance's magnitude over the frequencies of `band_hz`, which are
-        weighted as on a logarithmic axis.
+        geometric mean of the impedance's magnitude over the frequencies of `band_hz`, weighted
+        as on a logarithmic axis.
         """
         return self._average_magnitude(self.free)
 
@@ -523,16 +513,16 @@ class Transparency(NamedTuple):
         """Mean impedance that the operator feels while the other arm is clamped, in N m s/rad.
 
         The larger this mean is, the harder a rigid obstacle feels. It is the geometric mean of
-        the impedance's magnitude over the frequencies of `band_hz`, which are weighted as on a
+        the impedance's magnitude over the frequencies of `band_hz`, weighted as on a
         logarithmic axis.
         """
         return self._average_magnitude(self.clamped)
 
     @property
     def ratio_db(self) -> float:
-        """Mean ratio of the impedances with the other arm clamped and free, in dB.
+        """Mean ratio of the impedance with the other arm clamped to that with it free, in dB.
 
-        The ratio is the mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the frequencies of
+        The result is the mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the frequencies of
         `band_hz`, on a logarithmic axis. Z_clamped and Z_free are the impedances that the
         operator feels while the other arm is clamped or free.
         """
@@ -543,8 +533,8 @@ class Transparency(NamedTuple):
     def difference_nm_s_rad(self) -> float:
         """Mean difference of the impedances with the other arm clamped and free, in N m s/rad.
 
-        It is the geometric mean of abs(Z_clamped - Z_free) over the frequencies of `band_hz`,
-        which are weighted as on a logarithmic axis. Z_clamped and Z_free are the impedances
+        The result is the geometric mean of abs(Z_clamped - Z_free) over the frequencies of
+        `band_hz`, weighted as on a logarithmic axis. Z_clamped and Z_free are the impedances
         that the operator feels. The mean is zero if they are equal at any frequency.
         """
         difference = self.clamped - self.free
@@ -561,8 +551,8 @@ class Transparency(NamedTuple):
             frequency_hz: The frequency, in Hz.
 
         Returns:
-            The magnitude while the other arm is free, and the magnitude while it is clamped,
-            both in N m s/rad.
+            The magnitudes while the other arm is free and while it is clamped, both in N m
+            s/rad.
         """
         log_w = np.log(self.w_rad_s)
         target = np.log(2.0 * np.pi * frequency_hz)
@@ -598,11 +588,11 @@ class Transparency(NamedTuple):
 
     @classmethod
     def measure(cls, loop: LinearLoop, at: str, of: str) -> "tuple[Transparency, ...]":
-        """Computes what an operator feels of another arm that is free, and that is clamped.
+        """Computes what an operator feels while another arm is free and while it is clamped.
 
-        With ideal transparency the operator would feel nothing while the other arm is free, and
-        a rigid arm while it is clamped. The impedance along each joint i is
-        Z(j w) = 1 / Y_ii(j w) with the admittance Y of the loop. All other ports are free.
+        With ideal transparency, the operator would feel nothing while the other arm is free,
+        and a rigid arm while it is clamped. The impedance along each joint i is Z(j w) = 1 /
+        Y_ii(j w), where Y is the admittance of the loop. All other ports are free.
 
         Args:
             loop: The loop.

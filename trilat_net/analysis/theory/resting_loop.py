@@ -1,11 +1,11 @@
-"""Analyses the control loop of arms that rest in one common pose, with gains of choice.
+"""Analyses the control loop of arms at rest in one common pose, with arbitrary gains.
 
-The search for the gains of an arm (`trilat tune --arm`) asks for one number: at which rate
-small motions about a pose grow with these gains. `RestingLoop` answers it for any pose, any
-gains, and for the delays of the scenario or a constant delay instead.
+The search for the gains of an arm (`trilat tune --arm`) needs a single result: the rate at
+which small motions about a pose grow with these gains. `RestingLoop` computes it for any pose,
+any gains, and either the delays of the scenario or a constant delay.
 
 Invariant:
-    - The gains of the scenario do not matter, and neither do its start poses.
+    - The gains and the start poses of the scenario have no effect.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _NO_ROOT_PER_S = -1e3
 
 @dataclass(frozen=True)
 class RestingLoop:
-    """The linearised control loop of arms that rest in one common pose.
+    """The linearised control loop of arms at rest in one common pose.
 
     Attributes:
         conditions: Tick rates of the arms, and the delays between them.
@@ -39,13 +39,13 @@ class RestingLoop:
         """Returns the loop of the arms of a scenario, with the delays of its links.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
         """
         return cls(OperatingConditions.derive(scenario))
 
     @property
     def rate_hz(self) -> int:
-        """The tick rate of the first site, in Hz."""
+        """Tick rate of the first site, in Hz."""
         return self.conditions.sites[0].rate_hz
 
     @property
@@ -55,18 +55,18 @@ class RestingLoop:
 
     @property
     def largest_age_s(self) -> float:
-        """The largest age of the samples in use on any link, in s.
+        """Largest age of the samples in use on any link, in s.
 
-        The age of a sample (a state that one arm sent to another) is the time from its sending
-        until its use. If the ages of a link vary, their mean counts.
+        The age of a sample is the time between sending and use. For a link whose ages vary,
+        their mean is used.
         """
         return float(self.conditions.age_s.max())
 
     def find_age_quantile_s(self, quantile: float) -> float:
-        """Returns an age that a share of all samples in use do not exceed, in s.
+        """Returns the age that a given fraction of all samples in use does not exceed, in s.
 
         Args:
-            quantile: The share, from 0 to 1.
+            quantile: The fraction, from 0 to 1.
         """
         used = SamplesInUse.predict(self.conditions).used.values()
         ages_by_link = [np.arange(len(samples)) - samples for samples in used]
@@ -75,7 +75,7 @@ class RestingLoop:
         return age_ticks / self.rate_hz
 
     def fix_age(self, age_s: float) -> "RestingLoop":
-        """Returns the loop with one constant age of all samples, in place of ages that vary.
+        """Returns the loop with the same constant age of all samples, in place of varying ages.
 
         Args:
             age_s: The age, in s.
@@ -87,8 +87,8 @@ class RestingLoop:
     def find_root(self, law: Any, pose: Array, *, sampled: bool = True) -> CharacteristicRoot:
         """Returns the characteristic root of the loop with the largest real part.
 
-        The real part of the root is the rate, in 1/s, at which small motions grow. A negative
-        value means that they decay.
+        The real part is the rate, in 1/s, at which small motions grow. A negative value means
+        that they decay.
 
         Args:
             law: Control law of all arms, with its gains.

@@ -2,14 +2,14 @@
 
 The linear analysis needs the derivatives of the rates of change with respect to the state: the
 joint angles, the joint velocities, and the parameter estimates of the control law. The
-derivatives are computed with a complex step: the derivative of a function f at x is
-Im f(x + i h) / h, where i is the imaginary unit and h = 1e-30. The formula contains no
-subtraction. Therefore the result is exact to rounding (Squire and Trapp, "Using complex
-variables to estimate derivatives of real functions", SIAM Review 40, 1998).
+derivatives are computed with a complex step: the derivative of a function f at x is Im f(x + i
+h) / h, where i is the imaginary unit and h = 1e-30. Since the formula contains no subtraction,
+the result is exact up to rounding (Squire and Trapp, "Using complex variables to estimate
+derivatives of real functions", SIAM Review 40, 1998).
 
 Invariant:
-    - All arithmetic is plain NumPy on `textbook_arm`, without the compiled simulation kernel,
-      so that this module and the kernel check each other.
+    - All arithmetic is plain NumPy on `textbook_arm`, without the compiled simulation kernel.
+      The two implementations thus verify each other.
     - If a law has branches, for example at a wall or at the bounds of an estimate, the real
       part of the argument selects the branch whose derivatives are returned.
 """
@@ -41,23 +41,23 @@ class ArgumentLayout:
     operator. Numerical derivatives are taken with respect to this vector.
 
     Args:
-        joints: Number of joints n, which is the length of q, qd and the external torque.
+        joints: Number of joints n, the length of q, qd and the external torque.
         parameters: Length of the estimate.
         shared: Length m of each part that comes from peers. If 0, m is the number of joints.
-        peers: Number of peers whose samples an imported law also reads one by one.
+        peers: Number of peers whose samples an imported law also reads individually.
 
     Attributes:
         q, qd: Joint angles and velocities.
         estimate: The estimate theta_hat, or the memory of an imported law.
         q_des, qd_des: The reference q_id and its derivative. In task space the reference is a
-            pose, see `textbook_arm`.
-        peer_torque: External torque of the peers. In task space their force.
-        external_torque: Torque that an operator adds on the joints.
+            pose (see `textbook_arm`).
+        peer_torque: External torque of the peers, or their force in task space.
+        external_torque: Torque that an operator adds at the joints.
         inputs: All values from peers: the reference, its derivative, their torque, and then the
             samples of the individual peers.
         coordinates: Length m of each part that comes from peers.
         states: Length of the site's state: q, qd and theta_hat.
-        arguments: Length of the whole vector.
+        arguments: Length of the complete vector.
     """
 
     def __init__(
@@ -89,13 +89,13 @@ class ArgumentLayout:
         self.inputs = slice(self.states, self.external_torque.start)
 
     def peer_sample(self, index: int) -> slice:
-        """Returns the slice of the argument vector that contains the values from one other arm.
+        """Returns the slice of the argument vector that contains the values from one peer.
 
-        The values are the pose of that arm, the velocity of the pose, and the external torque,
+        The values are the pose of the peer, the velocity of the pose, and the external torque,
         in this order.
 
         Args:
-            index: Index of the other site, where the site itself is not counted.
+            index: Index of the peer, not counting the site itself.
         """
         length = 3 * self.coordinates
         first = self.peer_torque.stop + length * index
@@ -105,9 +105,9 @@ class ArgumentLayout:
     def of_site(cls, site: SiteSetup) -> "ArgumentLayout":
         """Returns where each state and input of a site is stored in one vector.
 
-        A site is a process that runs one arm. The vector is the argument of the functions that
-        compute how fast the states change. If a user wrote the control law, the values that the
-        law stores take the place of the parameter estimates.
+        The vector is the argument of the functions that compute how fast the states change. For
+        a control law written by a user, the values that the law stores take the place of the
+        parameter estimates.
 
         Args:
             site: Setup of the site.
@@ -124,9 +124,9 @@ _make_layout = cache(ArgumentLayout)
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
-    """Returns the model of an arm in given poses, with functions of the angles precomputed.
+    """Returns the model of an arm at given poses, with functions of the angles precomputed.
 
-    Its methods, such as the inertia matrix, therefore need no joint angles.
+    Its methods, such as the one for the inertia matrix, therefore need no joint angles.
 
     Args:
         site: Setup of the site.
@@ -138,10 +138,10 @@ def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
 
 
 class SiteRates(NamedTuple):
-    """Rates of change of an arm's states, with its torques and the values that it sends.
+    """Rates of change of an arm's states, along with its torques and the values that it sends.
 
-    The trailing axes "..." stand for several evaluations at once. In derivatives they have one
-    column for each entry of the argument vector.
+    The trailing axes "..." enumerate several evaluations. In derivatives, they have one column
+    per entry of the argument vector.
 
     Attributes:
         qdd: Joint accelerations, shape (n, ...), in rad/s^2.
@@ -170,10 +170,9 @@ class SiteRates(NamedTuple):
     def evaluate(cls, site: SiteSetup, x: Numbers) -> "SiteRates":
         """Computes how fast the states of a site change, and the torques that act on its arm.
 
-        A site is a process that runs one arm. Its states are joint angles, joint velocities and
-        parameter estimates. Operators and environments, such as walls, act as defined in the
-        setup. The equations are those of the site's control law and of the dynamics of its arm
-        (docs/reference/laws.md).
+        The states are joint angles, joint velocities and parameter estimates. Operators and
+        environments, such as walls, act as defined in the setup. The equations are those of the
+        site's control law and of the dynamics of its arm (docs/reference/laws.md).
 
         Args:
             site: Setup of the site.
@@ -217,15 +216,15 @@ class SiteRates(NamedTuple):
     def differentiate(cls, site: SiteSetup, x: Array) -> "SiteRates":
         """Computes derivatives of a site's rates of change, for the linear model of its arm.
 
-        A site is a process that runs one arm. The rates are differentiated with respect to each
-        of the site's states and inputs, by a complex step, which is exact up to rounding.
+        The rates are differentiated with respect to each of the site's states and inputs with a
+        complex step, which is exact up to rounding.
 
         Args:
             site: Setup of the site.
             x: States and inputs in the order of `ArgumentLayout.of_site`, shape (arguments,).
 
         Returns:
-            The derivatives of each rate, torque and output, with a column for each entry of x.
+            The derivatives of each rate, torque and output, with one column per entry of x.
         """
         steps = 1j * COMPLEX_STEP * np.eye(len(x))
         stepped = x[:, np.newaxis] + steps
@@ -237,8 +236,7 @@ class SiteRates(NamedTuple):
 def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
     """Computes the errors and the reference motion with which a site follows other sites.
 
-    A site is a process that runs one arm. Either its joints or its end effector follow the
-    desired motion that is part of x.
+    Either its joints or its end effector follow the desired motion that is part of x.
 
     Args:
         site: Setup of the site.
@@ -247,7 +245,7 @@ def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers)
             ...).
 
     Returns:
-        The errors of position and velocity, the reference velocity and acceleration for the
+        The errors of position and velocity, the reference velocity and acceleration of the
         joints, and the related Jacobian.
     """
     return _follow(site, arm, x, ArgumentLayout.of_site(site))
@@ -286,7 +284,7 @@ def _follow(
 def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
     """Returns the pose that an arm sends to the other arms.
 
-    It consists of the joint angles, or in task space of the pose of the end effector (tip).
+    The pose consists of the joint angles, or in task space of the pose of the end effector.
 
     Args:
         site: Setup of the site.
@@ -301,7 +299,7 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
 def compute_reflected_torque(site: SiteSetup, x: Numbers) -> Numbers:
     """Computes the torque of operators and walls that an arm sends to the other arms.
 
-    With this torque, a user feels what another arm touches. It is the entry `reflected` of
+    This torque lets a user feel what another arm touches. It is the entry `reflected` of
     `SiteRates.evaluate`, without the other entries.
 
     Args:
@@ -320,9 +318,8 @@ def compute_reflected_torque(site: SiteSetup, x: Numbers) -> Numbers:
 def has_estimate(site: SiteSetup) -> bool:
     """Returns True if the control law of a site has a state that changes from tick to tick.
 
-    A site is a process that runs one arm, and a tick is a period of its control loop. This
-    state consists of the parameter estimates of the adaptive law, or of the memory of a law
-    that a user wrote. It belongs to the site's state, in addition to angles and velocities.
+    This state consists of the parameter estimates of the adaptive law, or of the memory of a
+    law written by a user. It belongs to the site's state, in addition to angles and velocities.
 
     Args:
         site: Setup of the site.
@@ -553,9 +550,8 @@ def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -
 def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
     """Yields a sentence for each point at which the linear model of a site is one-sided.
 
-    A site is a process that runs one arm. Where its arm just touches a wall, or an estimate
-    just reaches its limit, the derivatives on both sides differ. The linear model contains only
-    one of them.
+    Where the arm barely touches a wall, or an estimate just reaches its limit, the derivatives
+    on the two sides differ. The linear model contains only one of them.
 
     Args:
         site: Setup of the site.

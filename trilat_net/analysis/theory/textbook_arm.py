@@ -1,14 +1,14 @@
 """Computes the dynamics of an arm from textbook equations, for the linear analysis.
 
 The arm is a chain of n joints. The module also computes the reference motion with which the arm
-follows other arms. All equations are written in plain NumPy and share no code with the compiled
-simulation, and therefore serve as an independent check. The planar arm with two joints is in
+follows other arms. All equations are implemented in plain NumPy and share no code with the
+compiled simulation, which makes them an independent check. The planar arm with two joints is in
 `analysis.arm_rows.PlacedArm`. Vectors have their components on the first axis, and any number
 of columns on the following axes.
 
 The equations use spatial vectors, which combine a linear and an angular half (Featherstone,
-"Rigid Body Dynamics Algorithms", 2008). The linear half comes first and belongs to the origin
-of the link's own frame. The following symbols are used:
+"Rigid Body Dynamics Algorithms", 2008). The linear half comes first and refers to the origin of
+the link's own frame. The following symbols are used:
 
 - q, qd: joint angles and their velocities.
 - v, a: reference velocities and accelerations of the joints, from the control law.
@@ -16,24 +16,24 @@ of the link's own frame. The following symbols are used:
 - X, S: transformation from the frame of the previous link, and axis of the joint.
 - x, x*: cross products of spatial motions and of spatial forces.
 
-The acceleration of link i includes gravity and follows from the acceleration A_p of the link
-before. It gives the force f_i on the link:
+The acceleration of link i includes gravity and is computed from the acceleration A_p of the
+previous link. It determines the force f_i on the link:
 
     A_i = X A_p + S a_i + V_i x (S v_i)
     f_i = I_i A_i + 1/2 (V_i x* I_i W_i + W_i x* I_i V_i - I_i (V_i x W_i))
 
-The force is linear in the ten inertial parameters p_i of the link: f_i = F_i p_i. This gives
-the regressor Y = (J_1' F_1 ... J_n' F_n), the matrix that multiplies the parameters in the
-torque, and the inertia matrix M = sum_i J_i' I_i J_i.
+The force is linear in the ten inertial parameters p_i of the link: f_i = F_i p_i. From this
+follow the regressor Y = (J_1' F_1 ... J_n' F_n), the matrix that multiplies the parameters in
+the torque, and the inertia matrix M = sum_i J_i' I_i J_i.
 
-If end effectors instead of joints follow each other, the reference motion is computed as in
+If end effectors follow each other instead of joints, the reference motion is computed as in
 `analysis.following.find_task_reference`. docs/reference/task-space.md contains the equations
 and sources.
 
 Invariant:
     - The arithmetic of the compiled simulation is not used.
-    - Every function is analytic in every argument. Therefore a complex step gives derivatives
-      that are exact to rounding. The only exception is a chain at a joint stop, where the real
+    - Every function is analytic in every argument, so a complex step yields derivatives that
+      are exact up to rounding. The only exception is a chain at a joint stop, where the real
       part of the argument selects the branch.
 """
 
@@ -164,11 +164,11 @@ class _PlacedLink(NamedTuple):
 
 
 class PlacedChain:
-    """Dynamics of a serial arm with n joints in given poses, such as its inertia matrix.
+    """Dynamics of a serial arm with n joints at given poses, such as its inertia matrix.
 
-    The class follows textbook formulas and is independent of the simulation, in order to check
-    it. The trailing axes "..." stand for the poses. It has the same methods as the planar arm,
-    `PlacedArm`.
+    The class implements textbook formulas independently of the simulation, in order to verify
+    the simulation. The trailing axes "..." enumerate the poses. It has the same methods as the
+    planar arm, `PlacedArm`.
 
     Args:
         chain: Description of the links and joints.
@@ -216,9 +216,9 @@ class PlacedChain:
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Computes the regressor Y, the matrix that multiplies an arm's parameters.
 
-        Y theta is the torque that the n links require for a reference motion, with the ten
-        inertial parameters of each link in theta. Drives and friction are not included. The arm
-        is in the pose of this object.
+        Y theta is the torque that the n links require for a reference motion, where theta
+        contains the ten inertial parameters of each link. Drives and friction are not included.
+        The arm is in the pose of this object.
 
         Args:
             qd: Joint velocities, shape (n, ...), in rad/s.
@@ -268,10 +268,10 @@ class PlacedChain:
         v: Numbers,
         a: Numbers,
     ) -> Numbers:
-        """Returns the torque that a reference motion requires, shape (n, ...), in N m.
+        """Returns the torque required for a reference motion, shape (n, ...), in N m.
 
-        It is M(q) a + C(q, qd) v + G(q) + friction(v), with the inertia matrix M including the
-        drives, the Coriolis matrix C and the gravity torque G.
+        This torque is M(q) a + C(q, qd) v + G(q) + friction(v), with the inertia matrix M
+        including the drives, the Coriolis matrix C and the gravity torque G.
 
         Args:
             theta: Dynamic parameters of the links, shape (10 n, ...).
@@ -288,7 +288,7 @@ class PlacedChain:
         return torque
 
     def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns the torque that overcomes the friction in the joints of the arm, in N m.
+        """Returns the torque needed to overcome the joint friction of the arm, in N m.
 
         Args:
             v: Joint velocities, shape (n, ...).
@@ -306,13 +306,10 @@ class PlacedChain:
         return viscous + coulomb
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the torque with which motors hold the arm still against gravity, in N m.
+        """Returns the torque that holds the arm still against gravity, shape (n, ...), in N m.
 
         Args:
             theta: Dynamic parameters of the links, shape (10 n, ...).
-
-        Returns:
-            Torque, shape (n, ...).
         """
         zeros = np.zeros_like(self._q)
         return self.required_torque(theta, zeros, zeros, zeros)
@@ -320,8 +317,8 @@ class PlacedChain:
     def inertia_matrix(self, theta: Numbers) -> Numbers:
         """Returns the inertia matrix M(q), which maps joint accelerations to torques.
 
-        It includes the inertia of the drives. The shape is (n, n, ...), with one matrix for
-        each set of joint angles.
+        The matrix includes the inertia of the drives. The shape is (n, n, ...), with one matrix
+        per pose.
 
         Args:
             theta: Dynamic parameters of the links, shape (10 n, ...).
@@ -383,9 +380,9 @@ class PlacedChain:
         return total
 
     def end_effector_position(self) -> Numbers:
-        """Returns the position of the end effector (tip) in the frame of the base, in m.
+        """Returns the position of the end effector in the base frame, in m.
 
-        The shape is (3, ...), with one column for each set of joint angles.
+        The shape is (3, ...), with one column per pose.
         """
         last = self._links[-1]
         tip_m = np.array(self._chain.tip_m)
@@ -394,10 +391,10 @@ class PlacedChain:
         return last.place_m + tip_offset_m
 
     def end_effector_orientation(self) -> Numbers:
-        """Returns the rotation matrix of the end effector in the frame of the base.
+        """Returns the rotation matrix of the end effector in the base frame.
 
-        The columns of a matrix are the axes of the end effector. The shape is (3, 3, ...), with
-        one matrix for each set of joint angles.
+        The columns of the matrix are the axes of the end effector. The shape is (3, 3, ...),
+        with one matrix per pose.
         """
         R_last = self._links[-1].R_base
         R_tip = self._chain.tip_rotation
@@ -405,9 +402,9 @@ class PlacedChain:
         return orientation
 
     def position_jacobian(self) -> Numbers:
-        """Returns the Jacobian J of the end effector's position: its velocity is J qd.
+        """Returns the Jacobian J of the end effector's position, whose velocity is J qd.
 
-        The shape is (3, n, ...). The entries are in m/rad, or without unit for a prismatic
+        The shape is (3, n, ...). The entries are in m/rad, or dimensionless for a prismatic
         joint.
         """
         return self.pose_jacobian()[:3]
@@ -415,8 +412,8 @@ class PlacedChain:
     def pose_jacobian(self) -> Numbers:
         """Returns the Jacobian J of the end effector's velocity, in the axes of the base.
 
-        J qd has the linear velocity in its first three rows, and the angular velocity in its
-        last three. The shape is (6, n, ...).
+        The first three rows of J qd are the linear velocity, the last three the angular
+        velocity. The shape is (6, n, ...).
         """
         last = self._links[-1]
         return self._move_to_tip(last.J)
@@ -562,7 +559,7 @@ _SMALL = 1e-4
 def rotation_from_vector(vector: Numbers) -> Numbers:
     """Returns the rotation matrix of a rotation vector, shape (3, 3, ...).
 
-    It is computed by Rodrigues' formula, with series for small angles.
+    Uses Rodrigues' formula, with series expansions for small angles.
 
     Args:
         vector: Axis times angle, shape (3, ...), in rad.
@@ -596,9 +593,9 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
 
 
 def vector_from_rotation(R: Numbers) -> Numbers:
-    """Returns the rotation vector of a rotation matrix, shape (3, ...), at most pi long.
+    """Returns the rotation vector of a rotation matrix, shape (3, ...), of length at most pi.
 
-    It is computed from the quaternion of the rotation.
+    The vector is computed from the quaternion of the rotation.
 
     Args:
         R: Rotation matrix, shape (3, 3, ...).
@@ -700,22 +697,21 @@ def _relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
 
 
 def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbers]) -> Numbers:
-    """Computes the pose that the end effector of a site follows, from the poses of all sites.
+    """Computes the reference pose of a site's end effector from the poses of all sites.
 
-    A site is a process that runs one arm. It follows site j with the weight alpha_j (dominance
-    factor). The position to follow is the weighted mean of the positions. For the orientation,
-    the rotation from each other site's orientation to the site's own orientation is written as
-    a rotation vector (axis times angle). The site's orientation is turned back by the weighted
-    sum of these vectors.
+    The site follows site j with the dominance factor alpha_j. The reference position is the
+    weighted mean of the positions. For the orientation, the rotation from each other site's
+    orientation to the site's own orientation is expressed as a rotation vector (axis times
+    angle). The site's orientation is then rotated back by the weighted sum of these vectors.
 
     Args:
-        shares: Weights alpha of all N sites, shape (N,).
+        shares: Dominance factors alpha for all N sites, shape (N,).
         site_pose: Pose of the site itself, shape (m, ...): the position and, if m is 6, a
             rotation vector in rad.
         shared: Pose of each site, shape (m, ...).
 
     Returns:
-        The pose to follow, shape (m, ...).
+        The reference pose, shape (m, ...).
     """
     pairs = zip(shares.tolist(), shared, strict=True)
     followed = [(share, pose) for share, pose in pairs if share]
@@ -744,8 +740,8 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
 class Following(NamedTuple):
     """Errors and reference motion with which an arm follows other arms.
 
-    Either its n joints follow, or its end effector (tip) along m coordinates. If the joints
-    follow, m is n.
+    Either the n joints follow, in which case m is n, or the end effector follows along m
+    coordinates.
 
     Attributes:
         x: Pose that other arms can follow, shape (m, ...).
@@ -755,10 +751,10 @@ class Following(NamedTuple):
         v: Reference velocity of the joints, shape (n, ...), in rad/s.
         a: Reference acceleration of the joints, the derivative of v, shape (n, ...), in
             rad/s^2.
-        J: Jacobian of the followed axes, shape (m, n, ...). `None` if joints follow.
-        A: Product J J', with a damping near singular poses, shape (m, m, ...). `None` if joints
-            follow.
-        least: Lower bound of the squared least singular value of J before the damping. Infinite
+        J: Jacobian of the followed axes, shape (m, n, ...), or `None` if joints follow.
+        A: Product J J', with damping added near singular poses, shape (m, m, ...), or `None` if
+            joints follow.
+        least: Lower bound on the squared smallest singular value of J before damping. Infinite
             if joints follow.
     """
 
@@ -781,8 +777,8 @@ class Following(NamedTuple):
             force: Force F along the followed axes, shape (m, ...).
 
         Returns:
-            Torque on the n joints, shape (n, ...). If joints follow instead of the end
-            effector, it is the argument itself.
+            Torque at the n joints, shape (n, ...). If joints follow instead of the end
+            effector, the argument itself.
         """
         if self.J is None:
             return force
@@ -793,14 +789,14 @@ class Following(NamedTuple):
         """Converts a joint torque to the corresponding force on the end effector.
 
         The force is A^-1 J tau, with the joint torque tau, the Jacobian J of the m followed
-        axes, and A = J J' plus a damping near singular poses.
+        axes, and A = J J' plus damping near singular poses.
 
         Args:
-            torque: Torque tau on the n joints, shape (n, ...), in N m.
+            torque: Torque tau at the n joints, shape (n, ...), in N m.
 
         Returns:
-            The force, shape (m, ...). If joints follow instead of the end effector, it is the
-            torque.
+            The force, shape (m, ...). If joints follow instead of the end effector, the
+            argument itself.
         """
         if self.J is None or self.A is None:
             return torque
@@ -866,8 +862,8 @@ class Following(NamedTuple):
             xd_des: Velocity of this pose, shape (m, ...).
 
         Returns:
-            The errors of the end effector, and the reference velocity and acceleration for the
-            joints. In a singular pose, all numbers that need the inverse of the Jacobian are
+            The errors of the end effector, and the reference velocity and acceleration of the
+            joints. In a singular pose, all values that require the inverse of the Jacobian are
             NaN.
         """
         assert site.chain is not None
@@ -920,9 +916,10 @@ class Following(NamedTuple):
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
-    """Returns the pose of the end effector (tip) that an arm sends to the other arms.
+    """Returns the pose of the end effector that an arm sends to the other arms.
 
-    It is the position in m, and the rotation vector in rad if the task includes orientation.
+    The pose consists of the position in m and, if the task includes orientation, the rotation
+    vector in rad.
 
     Args:
         task: The task, which states whether it includes orientation.

@@ -1,29 +1,28 @@
 """Decides whether an oscillation grows, decays or persists, over the second half of a run.
 
-The envelope of a signal is its largest magnitude in each short interval of time. The second
-half of the run is divided into 16 equal windows. If these windows do not decide, the half is
-divided into 8 windows. The maximum of each window, at least `FLOOR_RAD`, is taken. A straight
-line is fitted to the logarithms of these maxima. Its slope has one-sided confidence bounds of
-99.5 % (Student's t).
+The envelope of a signal is its largest magnitude in each short time interval. The second half
+of the run is divided into 16 equal windows, or into 8 windows if 16 do not decide. The maximum
+of each window, at least `FLOOR_RAD`, is taken, and a straight line is fitted to the logarithms
+of these maxima. Its slope has one-sided confidence bounds of 99.5 % (Student's t).
 
 The classes use the four quarters of the second half, and the three steps between the maxima of
-successive quarters:
+consecutive quarters:
 
-- GROWS: the lower bound of the slope is positive, and each step is a rise by 1 % or more. The
+- GROWS: the lower bound of the slope is positive, and each step is a rise of 1 % or more. The
   rise does not slow down: in logarithms, the last step is at least 3/4 of the first. If the
-  maxima rise by more than a factor of 8/5 in all, 0.45 of the first step suffices, because no
-  saturating response that starts at zero rises so much. Growth does not count if the first half
-  of the run falls by 1 % or more from each quarter to the next.
+  maxima rise by more than a factor of 8/5 in total, 0.45 of the first step is sufficient,
+  because no saturating response that starts at zero rises so much. Growth does not count if the
+  first half of the run falls by 1 % or more from each quarter to the next.
 - DECAYS: the upper bound of the slope is negative, and the line falls by a factor of two or
   more. The last step is a fall of at least half the size that it has in a steady fall by a
-  factor of two. An envelope whose last quarter does not exceed `FLOOR_RAD` decays as well.
+  factor of two. An envelope whose last quarter does not exceed `FLOOR_RAD` also decays.
 - HARDLY: the upper bound is negative, and the line falls by 4 % or more, but the conditions of
   DECAYS do not hold.
 - STEADY: the bounds show that the envelope neither doubles nor halves within the half.
 - UNDECIDED: no other class applies, or the last step is more than a doubling without growth.
 
-A class describes the record and predicts nothing. No finite record excludes growth that starts
-later. A beat that is longer than the run looks like growth while it rises.
+A class describes the record and predicts nothing. No finite record can rule out growth that
+starts later. A beat that is longer than the run looks like growth while it rises.
 """
 
 import math
@@ -59,7 +58,7 @@ _LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
 class EnvelopeTrend(Enum):
     """Trend of the magnitude of an oscillation in the second half of a run.
 
-    The module's docstring defines the classes.
+    The docstring of the module defines the classes.
     """
 
     DECAYS = auto()
@@ -70,9 +69,9 @@ class EnvelopeTrend(Enum):
 
 
 class EnvelopeFit(NamedTuple):
-    """Trend of an oscillation's amplitude: growing, decaying or constant. See `fit_envelopes`.
+    """Trend of an oscillation's amplitude: growing, decaying or constant (see `fit_columns`).
 
-    The envelope is the largest magnitude of a signal in each short interval of time.
+    The envelope is the largest magnitude of a signal in each short time interval.
 
     Attributes:
         trend: Class of the trend, such as growing or decaying.
@@ -88,60 +87,61 @@ class EnvelopeFit(NamedTuple):
     rate_per_s: float
     calm: bool = False
 
+    @classmethod
+    def fit_columns(
+        cls,
+        t_s: Array,
+        values: Array,
+        floor: float = FLOOR_RAD,
+        *,
+        falls_first: bool = False,
+    ) -> "list[EnvelopeFit]":
+        """Determines whether oscillations grow, decay or persist in the second half of a run.
 
-def fit_envelopes(
-    t_s: Array,
-    values: Array,
-    floor: float = FLOOR_RAD,
-    *,
-    falls_first: bool = False,
-) -> list[EnvelopeFit]:
-    """Determines whether oscillations grow, decay or persist, over the second half of a run.
+        The docstring of the module defines these classes.
 
-    The module's docstring defines these classes of the trend.
+        Args:
+            t_s: Times in ascending order, shape (K,), in s.
+            values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in
+                the interval that ends at a time.
+            floor: Value below which an envelope counts as zero, in the unit of `values`.
+            falls_first: True if an envelope that first falls and then rises counts as growing.
+                By default, the trend of such an envelope is undecided.
 
-    Args:
-        t_s: Ascending times, shape (K,), in s.
-        values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in the
-            interval that ends at a time.
-        floor: Value below which an envelope counts as zero. It has the unit of `values`.
-        falls_first: True if an envelope that first falls and then rises counts as growing. By
-            default the trend of such an envelope is undecided.
+        Returns:
+            The trend of each of the C envelopes.
+        """
+        envelopes = values.shape[1]
+        no_fit = cls(EnvelopeTrend.UNDECIDED, math.nan)
+        fits = [no_fit] * envelopes
+        undecided = list(range(envelopes))
+        for windows in _T_QUANTILES:
+            maxima = _find_window_maxima(t_s, values[:, undecided], windows, floor)
+            if maxima is None:
+                continue
+            half_s = 0.5 * (t_s[-1] - t_s[0])
+            window_fits = _fit_maxima(maxima, half_s / windows, math.log(floor))
+            for index, fit in zip(undecided, window_fits, strict=True):
+                fits[index] = fit
+            undecided = [
+                index for index in undecided if fits[index].trend is EnvelopeTrend.UNDECIDED
+            ]
+        growing = [index for index, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
+        if falls_first or not growing:
+            return fits
 
-    Returns:
-        The trend of each of the C envelopes.
-    """
-    envelopes = values.shape[1]
-    no_fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)
-    fits = [no_fit] * envelopes
-    undecided = list(range(envelopes))
-    for windows in _T_QUANTILES:
-        maxima = _find_window_maxima(t_s, values[:, undecided], windows, floor)
-        if maxima is None:
-            continue
-        half_s = 0.5 * (t_s[-1] - t_s[0])
-        window_fits = _fit_maxima(maxima, half_s / windows, math.log(floor))
-        for index, fit in zip(undecided, window_fits, strict=True):
-            fits[index] = fit
-        undecided = [
-            index for index in undecided if fits[index].trend is EnvelopeTrend.UNDECIDED
-        ]
-    growing = [index for index, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
-    if falls_first or not growing:
+        # growth after a fall in the first half is a V shape, in reversed time a rise
+        reversed_t_s = -t_s[::-1]
+        reversed_values = values[::-1, growing]
+        first_half = _find_window_maxima(reversed_t_s, reversed_values, 4, floor)
+        if first_half is None:
+            return fits
+        steps = np.diff(np.log(first_half), axis=0)
+        least_steps = steps.min(axis=0)
+        for index, least_step in zip(growing, least_steps, strict=True):
+            if least_step >= _LEAST_STEP:
+                fits[index] = fits[index]._replace(trend=EnvelopeTrend.UNDECIDED)
         return fits
-
-    # growth after a fall in the first half is a V shape; in reversed time the fall is a rise
-    reversed_t_s = -t_s[::-1]
-    reversed_values = values[::-1, growing]
-    first_half = _find_window_maxima(reversed_t_s, reversed_values, 4, floor)
-    if first_half is None:
-        return fits
-    steps = np.diff(np.log(first_half), axis=0)
-    least_steps = steps.min(axis=0)
-    for index, least_step in zip(growing, least_steps, strict=True):
-        if least_step >= _LEAST_STEP:
-            fits[index] = fits[index]._replace(trend=EnvelopeTrend.UNDECIDED)
-    return fits
 
 
 def _find_window_maxima(

@@ -1,23 +1,23 @@
-"""Measures whether small disturbances of a run grow or die away, by repeating the run.
+"""Measures whether small disturbances of a run grow or decay, by repeating the run.
 
-A repetition of the run that receives a small push, for example of one joint, is called a twin.
-Without the push, it would be identical to the run. 20 times per second, the differences d of
-the joint velocities between the twin and the run are computed. The size of the disturbance is
+A repetition of the run that receives a small push, for example at one joint, is called a twin.
+Without the push, it would be identical to the run. The differences d of the joint velocities
+between the twin and the run are computed 20 times per second. The size of the disturbance is
 their amplitude A, with
 
     A^2 = sum over joints of d^2 + (a / w)^2
 
-Here a is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts are
-equal on average. If d is an oscillation that grows or decays with a certain rate, A does not
+where a is the time derivative of d. The frequency w, in rad/s, is chosen to make both terms
+equal on average. If d is an oscillation that grows or decays at a certain rate, A does not
 oscillate, but is proportional to exp(rate t) over the time t. The rate is therefore the slope
-of log A over the part of the run that is judged. `envelope_trend` defines the bounds of the
-slope, and the classes such as "grows" and "decays".
+of log A over the judged part of the run. `envelope_trend` defines the bounds of the slope, and
+the classes such as "grows" and "decays".
 
 Invariant:
-    - Velocities are compared. If a push merely shifts all arms to another position of rest, the
+    - Velocities are compared. If a push merely shifts all arms to another equilibrium, the
       difference becomes zero.
     - In a scenario whose arms form groups that do not follow each other, each group is judged
-      separately, so that growth in one group is not hidden by another group.
+      separately. Growth in one group is therefore not hidden by another group.
 """
 
 import math
@@ -44,10 +44,10 @@ from ...hooks import find_hook
 from ...log import Log, open_log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
-from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
+from ..delay_period import DelayPeriod, find_burst_interval_s, find_final_link
 from ..run_end import RunEnd, find_coupled_sites
 from ..torque_sources import VirtualWall
-from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
+from .envelope_trend import EnvelopeFit, EnvelopeTrend
 
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""
@@ -77,7 +77,7 @@ MOST_LOG = 700.0
 
 
 class PushGrowth(NamedTuple):
-    """Development of the effect of one push over the judged part of a run.
+    """How the effect of one push develops over the judged part of a run.
 
     A push is a small disturbance in a repetition of the run, which is called a twin. Its effect
     is the difference between the twin and the run. If some arms of the scenario do not follow
@@ -88,19 +88,19 @@ class PushGrowth(NamedTuple):
         trend: Class of the trend of the difference, such as growing.
         rate_per_s: Rate of the difference, which is proportional to exp(rate t), in 1/s. NaN if
             the judged part is too short.
-        factor: Factor by which the difference changed over the judged part. 0 if it died down
-            to the rounding errors.
+        factor: Factor by which the difference changed over the judged part. 0 if it decayed to
+            the level of rounding errors.
         joint: Name of the joint with the worst trend: the joint at which the difference is
             largest at the end, or a joint whose difference grows or persists although the
-            largest difference dies away.
+            largest difference decays.
         group: Index of the group of sites.
-        becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings of
-            the difference undone.
-        ended_s: Time at which the twin ended before the run, in s, because the difference died
-            down to the rounding errors or the twin diverged. `None` if the twin did not end
-            early.
+        becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings of the
+            difference undone.
+        ended_s: Time at which the twin ended before the run, in s, because the difference
+            decayed to the level of rounding errors or the twin diverged. `None` if the twin did
+            not end early.
         leads: True if the difference at the end is largest at this joint, or if the difference
-            of all joints together grows as well.
+            of all joints together also grows.
     """
 
     push: Push
@@ -131,8 +131,8 @@ class _MissChance(NamedTuple):
     def of_directions(cls, directions: int) -> "_MissChance":
         """Estimates how likely pushes in random directions are to miss a clearly growing mode.
 
-        A mode that grows by `CLEAR_GROWTH` is missed if less than 1 / `CLEAR_GROWTH` of the
-        usual share of every push excites it. The share of a mode in a push with many random
+        A mode that grows by `CLEAR_GROWTH` is missed if every push excites it with less than 1
+        / `CLEAR_GROWTH` of the usual share. The share of a mode in a push with many random
         components is nearly normally distributed, with the density 1 / sqrt(2 pi) at zero.
 
         Args:
@@ -146,9 +146,9 @@ class _MissChance(NamedTuple):
 
 
 class RestDeparture(NamedTuple):
-    """Interval of time in which a run moved away from rest by itself: this rest is unstable.
+    """Time interval in which a run departed from rest by itself, so this rest is unstable.
 
-    Its twins, repeated runs with a small push, did the same. No operator or wall acted on the
+    Its twins (repeated runs with a small push) did the same. No operator or wall acted on the
     arms during this time.
 
     Attributes:
@@ -165,27 +165,27 @@ class RestDeparture(NamedTuple):
 
 
 class TwinGrowth(NamedTuple):
-    """Whether the effects of small pushes on a run grow or die away, see `TwinGrowth.of_twins`.
+    """Whether the effects of small pushes on a run grow or decay (see `TwinGrowth.of_twins`).
 
     Each push is made in a repetition of the run, which is called a twin. The difference between
     the twin and the run is then observed.
 
     Attributes:
         why: The reason why there are no twins. Empty if there are twins.
-        from_s: Start of the part of the run that is judged, in s.
+        from_s: Start of the judged part of the run, in s.
         to_s: End of this part, in s.
         pushes: Growth of every push, in every group of sites that follow each other.
-        departure: Fastest departure of the run from rest. `None` if the run did not leave a
-            position of rest.
+        departure: Fastest departure of the run from rest, or `None` if the run did not depart
+            from rest.
         same_platform: False if the run was recorded on another platform. The last bits of the
             repeated run may then differ from the log.
         links_random: True if some link draws its delays at random. Slow trends may then be due
             to chance.
-        delay_period_s: Time after which delays that vary, and the ticks of all sites, repeat,
-            in s. `None` if delays are constant, random, or never repeat.
-        burst_interval_s: Mean time from one burst of lost samples to the next, in s. `None` if
-            no link loses samples in bursts.
-        twins: The twins themselves, for figures. `None` without twins.
+        delay_period_s: Time after which varying delays and the ticks of all sites repeat, in s,
+            or `None` if delays are constant, random, or never repeat.
+        burst_interval_s: Mean time between two bursts of lost samples, in s, or `None` if no
+            link loses samples in bursts.
+        twins: The twins themselves, for figures, or `None` if there are none.
     """
 
     why: str
@@ -203,7 +203,7 @@ class TwinGrowth(NamedTuple):
     def hides_period(self) -> bool:
         """True if the period of the delays is longer than the judged part of the run.
 
-        Pushes that died away in this part might then grow in the rest of the period. A decision
+        Pushes that decayed in this part might then grow in the rest of the period. A decision
         without a proof therefore stays open.
         """
         judged_s = self.to_s - self.from_s
@@ -211,33 +211,33 @@ class TwinGrowth(NamedTuple):
 
     @property
     def trend(self) -> EnvelopeTrend:
-        """Whether the effect of the worst push grows or dies away, as a class.
+        """Whether the effect of the worst push grows or decays, as a class.
 
-        The worst push is the push whose effect grows most or dies away most slowly. The trend
-        is undecided if there are no pushes.
+        The worst push is the one whose effect grows most or decays most slowly. The trend is
+        undecided if there are no pushes.
         """
         return EnvelopeTrend.UNDECIDED if self.worst is None else self.worst.trend
 
     @property
     def worst(self) -> PushGrowth | None:
-        """The small push whose effect on the run grew most, or died away most slowly.
+        """The small push whose effect on the run grew most, or decayed most slowly.
 
-        Each push was made in a repetition of the run. The trend of this push counts as the
+        Each push was made in a repetition of the run. The trend of this push is taken as the
         trend of the whole run. `None` if there are no pushes.
         """
         return max(self.pushes, key=_rank_badness, default=None)
 
     @property
     def grows(self) -> bool:
-        """True if small disturbances of the run grow, that is, if the run is unstable.
+        """True if small disturbances of the run grow, which means that the run is unstable.
 
         A push is a small disturbance in a repetition of the run. Arms that follow each other
         form a group. The disturbances of a group grow if the effects of at least half of its
-        pushes grow throughout, from `from_s` to `to_s`. The disturbances also grow if the
-        motion of the same joint grows throughout after at least two pushes, and is the fastest
-        motion after one of these pushes. The reason is that a joint that does not act on the
+        pushes grow throughout, from `from_s` to `to_s`. They also grow if the motion of the
+        same joint grows throughout after at least two pushes, and is the fastest motion after
+        one of these pushes. This second rule exists because a joint that does not act on the
         others moves only after the pushes that reach it. If network delays are random, the
-        effects must grow by a factor of two, to exclude chance.
+        effects must grow by a factor of two, to rule out chance.
         """
         least_factor = DOUBLES if self.links_random else 1.0
         grown = []
@@ -261,7 +261,8 @@ class TwinGrowth(NamedTuple):
     def miss_chance(self) -> _MissChance | None:
         """Probability that random pushes fail to reveal that a run is unstable.
 
-        `None` if each joint was pushed by itself, because such pushes have no random direction.
+        `None` if each joint was pushed individually, because such pushes have no random
+        direction.
         """
         directions = {push.push.direction for push in self.pushes if push.push.direction}
         if not directions:
@@ -270,10 +271,10 @@ class TwinGrowth(NamedTuple):
 
     @property
     def judged_bursts(self) -> float:
-        """Mean number of bursts of lost messages in the judged part of the run.
+        """Mean number of bursts of lost samples in the judged part of the run.
 
-        A trend over few bursts says little about a run with more bursts. The number is that of
-        the network link with the fewest bursts. It is infinite if no link loses messages in
+        A trend over few bursts says little about a run with more bursts. The number refers to
+        the network link with the fewest bursts. It is infinite if no link loses samples in
         bursts.
         """
         if self.burst_interval_s is None:
@@ -282,11 +283,10 @@ class TwinGrowth(NamedTuple):
 
     @property
     def needs_s(self) -> float | None:
-        """Length that the run should have to show clearly that small pushes die away, in s.
+        """Length of a run that would clearly show that small pushes decay, in s.
 
-        Within this length, the push that dies away most slowly can halve four more times at its
-        present rate. `None` if the pushes do not die away, or if the run is long enough
-        already.
+        Within this length, the push that decays most slowly can halve four more times at its
+        present rate. `None` if the pushes do not decay, or if the run is already long enough.
         """
         worst = self.worst
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
@@ -298,8 +298,8 @@ class TwinGrowth(NamedTuple):
         """Rate in 1/s above which no disturbance of the run can grow.
 
         A disturbance with a larger rate would have grown by the factor `CLEAR_GROWTH` from
-        `from_s` to `to_s`, and would have been seen in the repeated runs. If not every push
-        dies away, no rate is excluded, and the value is infinite.
+        `from_s` to `to_s`, which the repeated runs would have shown. If not every push decays,
+        no rate is excluded, and the value is infinite.
         """
         judged_s = self.to_s - self.from_s
         dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
@@ -309,7 +309,7 @@ class TwinGrowth(NamedTuple):
         """Converts the trends of each push and of all pushes together to plain JSON values.
 
         The trend of a push states how its effect developed, with its rate in 1/s and the factor
-        by which it grew or fell. Numbers that are not finite become `None`.
+        by which it grew or fell. Values that are not finite become `None`.
         """
         pushes = [
             {
@@ -337,12 +337,12 @@ class TwinGrowth(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for the user that says whether small pushes of the run grow or die away.
+        """A sentence for the user on whether small pushes of the run grow or decay.
 
-        The sentence describes the push that grows most or dies away most slowly. If the arms
-        left a position of rest by themselves, the sentence describes that motion instead. If
-        the run was not repeated with pushes, the sentence gives the reason. The package
-        `presentation` writes it.
+        The sentence describes the push that grows most or decays most slowly. If the arms
+        departed from rest by themselves, the sentence describes that motion instead. If the run
+        was not repeated with pushes, the sentence states the reason. The package `presentation`
+        generates it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -363,7 +363,8 @@ class TwinGrowth(NamedTuple):
             log: The log of the run.
             end: How the run ended, and from what time on it is judged.
             count: Number of twins. If `None`, enough to push each joint (`Push.choose`).
-            own_laws: True to run the code of control laws that are not part of this program.
+            own_laws: True to execute the code of control laws that are not part of this
+                program.
 
         Returns:
             How the effects of the pushes grow. If the run cannot be repeated, the result
@@ -388,10 +389,11 @@ class TwinGrowth(NamedTuple):
     ) -> "TwinGrowth":
         """Simulates a scenario with small pushes, and judges whether their effects grow.
 
-        No log is needed: the run and its repetitions with a push, the twins, are simulated.
+        No log is needed: both the run and its repetitions with a push (the twins) are
+        simulated.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
             end: How the run ended, and from what time on it is judged.
             duration_s: Length of the run, in s.
             count: Number of twins. If `None`, enough to push each joint (`Push.choose`).
@@ -410,16 +412,16 @@ class TwinGrowth(NamedTuple):
         counts_from_s: float,
         quiet_from_s: float,
     ) -> "TwinGrowth":
-        """Judges whether the effects of small pushes on a run grow or die away.
+        """Judges whether the effects of small pushes on a run grow or decay.
 
         Each push is made in a repetition of the run, a twin. The difference between twin and
         run is evaluated over the judged part of the run.
 
         Args:
-            scenario: The description of the experiment.
+            scenario: The scenario.
             twins: The twins.
-            counts_from_s: Time after which the run is considered, in s. The second half of the
-                time after it is judged.
+            counts_from_s: Only the run after this time is considered, in s. The second half of
+                the time after it is judged.
             quiet_from_s: Time after which no operator acts on the run and its control loop does
                 not change, in s. Departures from rest are searched for after this time.
         """
@@ -441,7 +443,7 @@ class TwinGrowth(NamedTuple):
             joints: list[int] = []
             for site in sites:
                 joints += range(first_joints[site], first_joints[site + 1])
-            amplitudes = [measure_amplitude(path, joints) for path in twins.paths]
+            amplitudes = [_measure_amplitude(path, joints) for path in twins.paths]
             for path, amplitude in zip(twins.paths, amplitudes, strict=True):
                 is_affected = np.isfinite(amplitude[first:end]).any()
                 if is_affected:
@@ -483,7 +485,7 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
     links = [find_final_link(scenario, name) for name in scenario.links]
     if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
         return None
-    return find_final_delay_period(scenario).true_s
+    return DelayPeriod.of_scenario(scenario).true_s
 
 
 def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:
@@ -506,7 +508,7 @@ def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -
     return end_s - 2.0 * whole_periods * period_s
 
 
-def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
+def _measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
     """Computes the effect of a small push on a run over time, as a logarithm.
 
     A twin is a repetition of the run with a small push. The effect is the amplitude A of the
@@ -607,7 +609,7 @@ def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
     finite_log = np.where(is_finite, amplitude, -np.inf)
     scaled_amplitude = np.exp(finite_log - amplitude[is_finite].max())
     one_column = scaled_amplitude[:, np.newaxis]
-    (fit,) = fit_envelopes(t_s, one_column, _AMPLITUDE_FLOOR, falls_first=True)
+    (fit,) = EnvelopeFit.fit_columns(t_s, one_column, _AMPLITUDE_FLOOR, falls_first=True)
     return fit
 
 
@@ -697,7 +699,7 @@ def _judge_worst_joint(
     if len(joints) == 1 or worst.ended_s is not None:
         return worst
     for joint in joints:
-        joint_amplitude = measure_amplitude(path, [joint])
+        joint_amplitude = _measure_amplitude(path, [joint])
         unscaled_amplitude = joint_amplitude - path.scale
         # a difference of the size of the rounding errors says nothing about the push
         joint_amplitude[unscaled_amplitude < math.log(SMALLEST)] = -np.inf
@@ -815,15 +817,15 @@ class _LinearSizes(NamedTuple):
 class PushedTwins(Result):
     """Result of `trilat twin`: how pushes at a given time of a recorded run develop.
 
-    For example, a push changes the angle of one joint by a small amount, in a repetition of the
-    run that is called a twin. The result says whether the difference from the run grows or dies
-    away.
+    A push may, for example, change the angle of one joint by a small amount, in a repetition of
+    the run that is called a twin. The result shows whether the difference from the run grows or
+    decays.
 
     Attributes:
         log: The log of the run.
         at_s: Time of the pushes, in s.
         growth: Growth of the pushes.
-        linear: Range of sizes for which the effect of a push is proportional to its size.
+        linear: Range of sizes for which the effect of a push is proportional to its size, or
             `None` if the user did not ask for several sizes.
     """
 
@@ -832,8 +834,25 @@ class PushedTwins(Result):
     growth: TwinGrowth
     linear: _LinearSizes | None = None
 
+    def measure_amplitudes(self, joints: Sequence[int]) -> list[Array]:
+        """Computes the effect of each push on some joints over time, as logarithms.
+
+        The docstring of the module defines the amplitude A of the difference between a twin and
+        the run.
+
+        Args:
+            joints: Indices of the joints.
+
+        Returns:
+            log A for each twin, in the order of the pushes, shape (K,) each, with A in rad/s.
+            It is -inf where the difference is zero. Empty if there are no twins.
+        """
+        if self.growth.twins is None:
+            return []
+        return [_measure_amplitude(path, joints) for path in self.growth.twins.paths]
+
     def describe(self, pushed: PushGrowth) -> str:
-        """Returns a sentence for the user on whether the effect of a push grows or dies away.
+        """Returns a sentence for the user on whether the effect of a push grows or decays.
 
         The sentence names the push, such as its joint and size, and the rate.
 
@@ -845,14 +864,14 @@ class PushedTwins(Result):
     def headline(self) -> str:
         """Returns a sentence for the user on how the pushes develop.
 
-        It describes the worst push, which grows most or dies away most slowly. If the user
-        requested pushes of several sizes, it states instead for which sizes the effect is
+        The sentence describes the worst push, which grows most or decays most slowly. If the
+        user requested pushes of several sizes, it states instead for which sizes the effect is
         proportional to the size.
         """
         return str(find_hook("describe a finding")(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table row for each small push: the pushed quantity and the effect.
+        """Returns one table row per small push, with the pushed quantity and the effect.
 
         Each push was made in a repetition of the run. The keys are those of an entry of
         `pushes` in `trilat twin --json`.
@@ -864,9 +883,9 @@ class PushedTwins(Result):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts pushes and their effects to plain values, as `trilat twin --json` prints.
+        """Converts pushes and their effects to the plain values of `trilat twin --json`.
 
-        The entry "linear" is `None` if the growth was not compared with characteristic roots.
+        The entry "linear" is `None` if the user did not ask for several sizes of a push.
         """
         growth = self.growth.to_json()
         text = self.headline()
@@ -1012,7 +1031,7 @@ def _find_linear_sizes(
     assert growth.twins is not None
     paths = growth.twins.paths
     all_joints = range(len(growth.twins.joints))
-    envelopes = [_running_maximum(measure_amplitude(path, all_joints)) for path in paths]
+    envelopes = [_running_maximum(_measure_amplitude(path, all_joints)) for path in paths]
     unit = paths[0].push.name.partition(" ")[2]
     largest_linear = sizes[-1]
     beyond = None

@@ -17,8 +17,8 @@ import inspect
 import os
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, wraps
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -38,7 +38,7 @@ from ...files import (
 from ...package_names import PACKAGE_COMMANDS
 from ...presentation import err, print_error, print_line
 from ...signals import Interrupt
-from . import options, sessions
+from . import sessions
 from .options import flag
 
 _SYNONYMS = {
@@ -145,7 +145,7 @@ class _Command(TyperCommand):
         Raises:
             UsageError: The value of an option --set was not quoted, and the shell has split it.
         """
-        whole = options.find_split_setting(args)
+        whole = _find_split_setting(args)
         if whole:
             quoted = join_arguments(["--set", whole])
             ctx.fail(
@@ -340,6 +340,57 @@ _PANELS = {
 A command that no panel names is in the last panel.
 """
 _PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}
+
+
+def _expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Turns a function that has named tuples of options as parameters into a command.
+
+    Several commands share options, such as those that name a network connection. These options
+    are the fields of one named tuple, such as `Reach`. Typer, the command line library, makes
+    one option of each parameter, and does not support such tuples. Therefore the returned
+    function has one parameter per field. When it is called, it puts the fields into their
+    tuples and calls the original function.
+
+    Args:
+        run: Function that executes the command, with groups of options as parameters.
+
+    Returns:
+        The function with one parameter per option.
+    """
+    declared = inspect.signature(run).parameters
+    tuples = {}
+    for name, parameter in declared.items():
+        is_tuple = hasattr(parameter.annotation, "_fields")
+        if is_tuple:
+            tuples[name] = parameter.annotation
+
+    parameters = []
+    for name, parameter in declared.items():
+        fields = [parameter]
+        if name in tuples:
+            fields = list(inspect.signature(tuples[name]).parameters.values())
+        parameters += [field.replace(kind=inspect.Parameter.KEYWORD_ONLY) for field in fields]
+
+    @wraps(run)
+    def run_with_tuples(**arguments: Any) -> Any:
+        """Calls the function of the command, after the options have been put into their tuples.
+
+        Args:
+            **arguments: Value of each option, by the name of its parameter.
+        """
+        for name, option_tuple in tuples.items():
+            values = [arguments.pop(field) for field in option_tuple._fields]
+            arguments[name] = option_tuple(*values)
+        return run(**arguments)
+
+    # Typer reads the parameters from these two attributes.
+    vars(run_with_tuples)["__signature__"] = inspect.Signature(parameters)
+    run_with_tuples.__annotations__ = {
+        parameter.name: parameter.annotation for parameter in parameters
+    }
+    return run_with_tuples
+
+
 _GROUPS: dict[str, dict[str, Any]] = {
     "log": {
         "help": "Inspects, checks, signs, recovers, exports or views a log.",
@@ -373,7 +424,7 @@ _GROUPS: dict[str, dict[str, Any]] = {
         ),
     },
     "set": {
-        "callback": options.expand_option_tuples(sessions.set_command),
+        "callback": _expand_option_tuples(sessions.set_command),
         "epilog": "Example: trilat set --session paper link 'm1->s' --delay 350ms\n\n"
         "Docs: docs/reference/links.md",
     },
@@ -409,7 +460,7 @@ def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
     declare = group.command(
         name, cls=_Command, help=help_text, epilog=epilog, rich_help_panel=panel
     )
-    declare(options.expand_option_tuples(run))
+    declare(_expand_option_tuples(run))
 
 
 def _find_panel(name: str) -> str:
@@ -540,3 +591,46 @@ def _report_system_error(error: Exception) -> int:
 
     is_bad_name = is_invalid or error.errno == errno.ENAMETOOLONG
     return 2 if is_bad_name else 1
+
+
+_BRACKETS = {"{": "}", "[": "]"}
+"""Closing brackets of tables and lists, by the opening brackets."""
+
+
+def _find_split_setting(args: Sequence[str]) -> str:
+    """Finds a value of --set that a shell has split, because the user did not quote it.
+
+    A shell that expands braces makes two arguments of `dominance.m1={m2=0.1,s=0.9}`, which are
+    `dominance.m1=m2=0.1` and `dominance.m1=s=0.9`. A value with spaces is split at them.
+
+    Args:
+        args: Arguments of a command.
+
+    Returns:
+        The setting as the user wrote it. Empty if no setting was split.
+    """
+    for index, argument in enumerate(args[:-1]):
+        if argument != "--set":
+            continue
+        setting, *other_arguments = args[index + 1 :]
+
+        key, _, first_value = setting.partition("=")
+        prefix = f"{key}="
+        values = [first_value]
+        for next_argument in other_arguments:
+            if not next_argument.startswith(prefix):
+                break
+            values.append(next_argument.removeprefix(prefix))
+
+        if len(values) > 1:  # the shell has expanded braces
+            is_table = all("=" in entry for entry in values)
+            opening = "{" if is_table else "["
+            return f"{prefix}{opening}{','.join(values)}{_BRACKETS[opening]}"
+
+        # The value begins with a bracket that is closed in a later argument.
+        closing = _BRACKETS.get(first_value[:1], "")
+        if closing and closing not in first_value:
+            for count, next_argument in enumerate(other_arguments, 1):
+                if closing in next_argument:
+                    return " ".join([setting, *other_arguments[:count]])
+    return ""

@@ -192,8 +192,8 @@ def record_command(
         path,
         force=force,
         durable=durable,
-        split_bytes=parse_split("--split-size", "MiB", split_size, 1 << 20),
-        split_ns=parse_split("--split-duration", "seconds", split_duration, 10**9),
+        split_bytes=_parse_split("--split-size", "MiB", split_size, 1 << 20),
+        split_ns=_parse_split("--split-duration", "seconds", split_duration, 10**9),
         carry_on=carry_on,
         choice=ChannelFilter.parse(include or [], exclude or []),
     )
@@ -353,7 +353,7 @@ def replay_command(
             during the replay.
     """
     from trilat_net.app.play.play_process import PlayOptions, play_log
-    from trilat_net.app.play.player import parse_rate
+    from trilat_net.app.play.player import Pace
     from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 
     from ...net import DefaultEndpoints
@@ -369,7 +369,7 @@ def replay_command(
         duration_s=duration,
         time=time,
     )
-    speed = parse_rate(rate)
+    speed = Pace.parse_rate(rate)
     preload_bytes = preload << 20
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         header, block = preload_messages(files, selection, preload_bytes, progress)
@@ -699,7 +699,7 @@ def _print_router_line(text: str) -> None:
     terminal.print_line(f"router: {text}")
 
 
-def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
+def _parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
     """Parses an option such as --split-size, the size or duration at which a log is split.
 
     For example, 2 MB with the scale 1e6 gives 2000000 bytes.

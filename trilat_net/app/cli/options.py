@@ -2,15 +2,14 @@
 
 They select a scenario, a network connection or a log. Options that belong together are fields
 of a named tuple. For example, the fields of `Reach` say how a command reaches a session. A
-command that has a parameter of this type accepts all of its options (`expand_option_tuples`),
-and the methods of the tuple then open the connection or read the file.
+command that has a parameter of this type accepts all of its options. The methods of the tuple
+then open the connection or read the file.
 """
 
 import inspect
 import math
 import re
 from collections.abc import Callable, Sequence
-from functools import wraps
 from importlib import import_module, resources
 from pathlib import Path
 from pkgutil import iter_modules
@@ -281,49 +280,6 @@ InsecureOption = Annotated[
         "trust.",
     ),
 ]
-
-
-_BRACKETS = {"{": "}", "[": "]"}
-"""Closing brackets of tables and lists, by the opening brackets."""
-
-
-def find_split_setting(args: Sequence[str]) -> str:
-    """Finds a value of --set that a shell has split, because the user did not quote it.
-
-    A shell that expands braces makes two arguments of `dominance.m1={m2=0.1,s=0.9}`, which are
-    `dominance.m1=m2=0.1` and `dominance.m1=s=0.9`. A value with spaces is split at them.
-
-    Args:
-        args: Arguments of a command.
-
-    Returns:
-        The setting as the user wrote it. Empty if no setting was split.
-    """
-    for index, argument in enumerate(args[:-1]):
-        if argument != "--set":
-            continue
-        setting, *other_arguments = args[index + 1 :]
-
-        key, _, first_value = setting.partition("=")
-        prefix = f"{key}="
-        values = [first_value]
-        for next_argument in other_arguments:
-            if not next_argument.startswith(prefix):
-                break
-            values.append(next_argument.removeprefix(prefix))
-
-        if len(values) > 1:  # the shell has expanded braces
-            is_table = all("=" in entry for entry in values)
-            opening = "{" if is_table else "["
-            return f"{prefix}{opening}{','.join(values)}{_BRACKETS[opening]}"
-
-        # The value begins with a bracket that is closed in a later argument.
-        closing = _BRACKETS.get(first_value[:1], "")
-        if closing and closing not in first_value:
-            for count, next_argument in enumerate(other_arguments, 1):
-                if closing in next_argument:
-                    return " ".join([setting, *other_arguments[:count]])
-    return ""
 
 
 MOST_LETTERS = 80
@@ -770,55 +726,6 @@ class RunOptions(NamedTuple):
         if duration_s is None and not is_duration_overridden:
             duration_s = longest_s
         return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
-
-
-def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Turns a function that has named tuples of options as parameters into a command.
-
-    Several commands share options, such as those that name a network connection. These options
-    are the fields of one named tuple, such as `Reach`. Typer, the command line library, makes
-    one option of each parameter, and does not support such tuples. Therefore the returned
-    function has one parameter per field. When it is called, it puts the fields into their
-    tuples and calls the original function.
-
-    Args:
-        run: Function that executes the command, with groups of options as parameters.
-
-    Returns:
-        The function with one parameter per option.
-    """
-    declared = inspect.signature(run).parameters
-    tuples = {}
-    for name, parameter in declared.items():
-        is_tuple = hasattr(parameter.annotation, "_fields")
-        if is_tuple:
-            tuples[name] = parameter.annotation
-
-    parameters = []
-    for name, parameter in declared.items():
-        fields = [parameter]
-        if name in tuples:
-            fields = list(inspect.signature(tuples[name]).parameters.values())
-        parameters += [field.replace(kind=inspect.Parameter.KEYWORD_ONLY) for field in fields]
-
-    @wraps(run)
-    def run_with_tuples(**arguments: Any) -> Any:
-        """Calls the function of the command, after the options have been put into their tuples.
-
-        Args:
-            **arguments: Value of each option, by the name of its parameter.
-        """
-        for name, option_tuple in tuples.items():
-            values = [arguments.pop(field) for field in option_tuple._fields]
-            arguments[name] = option_tuple(*values)
-        return run(**arguments)
-
-    # Typer reads the parameters from these two attributes.
-    vars(run_with_tuples)["__signature__"] = inspect.Signature(parameters)
-    run_with_tuples.__annotations__ = {
-        parameter.name: parameter.annotation for parameter in parameters
-    }
-    return run_with_tuples
 
 
 def parse_viz_rate(text: str) -> float:

@@ -46,7 +46,6 @@ def sim_command(
     It writes the same kind of log as a live session.
     """
     from ...execution import record_virtual
-    from ...own_code import find_user_laws
     from .options import parse_viz_rate
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -88,7 +87,9 @@ def sim_command(
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {_describe_length(chosen, path)}")
-        permissions = {f" --law {shlex.quote(str(law.file))}" for law in find_user_laws(chosen)}
+        permissions = {
+            f" --law {shlex.quote(str(law.file))}" for law in chosen.inspect_user_laws()
+        }
         report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(permissions))}"
         terminal.print_text(f"next: {report}")
 
@@ -580,10 +581,9 @@ def linear_command(
     verdict.
     """
     options.check_picture(picture, force=force)
-    from ...analysis import analyse_linear_loop, read_hands
+    from ...analysis import analyse_linear_loop
 
     draws_ports = picture is not None and drawn is not LinearFigure.ROOTS
-    hands = read_hands(operators or [])
     with terminal.progress_lines(f"linearising {scenario}"):
         analysis = analyse_linear_loop(
             scenario,
@@ -592,7 +592,7 @@ def linear_command(
             roots=roots,
             over=over or [],
             ports=ports or draws_ports,
-            hands=hands,
+            operators=operators or [],
         )
     # The ports may have been analysed only for the figure; then they are not printed.
     prints_ports = ports or as_json

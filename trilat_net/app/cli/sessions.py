@@ -675,11 +675,11 @@ def doctor_command(
     options of the site, recorder or router that will run on this machine. The exit code is 1 if
     a check fails.
     """
-    from trilat_net.app.doctor import examine_machine
+    from trilat_net.app.doctor import MachineExamination
 
     connection = ways.find_endpoints()
     name = None if session is None else options.check_session_name(session)
-    examined = examine_machine(
+    examination = MachineExamination(
         connection=connection,
         keys=ways.keys,
         folder=folder,
@@ -690,7 +690,7 @@ def doctor_command(
 
     # Each check is printed as soon as it is done, because some take seconds.
     findings = []
-    for finding in examined:
+    for finding in examination.run():
         findings.append(finding)
         if not as_json:
             terminal.print_marked(MARKS[finding.state], f"{finding.check:<10}  {finding.text}")

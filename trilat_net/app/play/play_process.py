@@ -25,7 +25,7 @@ from trilat_net.records import NS_PER_S
 from ...net import Bus, Clock, Connection, SessionMembers
 from .batch import MessageBatch
 from .message_source import MessageSource
-from .player import LatenessSummary, Pace, Player, PlayProgress
+from .player import LatenessHistogram, Pace, Player, PlayProgress
 from .session_reader import HORIZON_NS, PlaySelection, SessionHeader
 from .site_stand_ins import PlayedHistory, SiteStandIns
 
@@ -87,7 +87,7 @@ class PlaybackSummary(NamedTuple):
 
     counts: dict[str, int]
     rounds: int
-    lateness: LatenessSummary | None
+    lateness: LatenessHistogram.Summary | None
     took_s: float
     held_s: float
     cut: int

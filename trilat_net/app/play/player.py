@@ -82,35 +82,35 @@ class Pace:
         """
         return Pace(self.due_ns(self.start_ns + length_ns), self.start_ns, self.rate)
 
+    @staticmethod
+    def parse_rate(text: str) -> float:
+        """Parses the option `--rate`, the speed of a playback relative to the recorded run.
 
-def parse_rate(text: str) -> float:
-    """Parses the option `--rate`, the speed of a playback relative to the recorded run.
+        For example, "2" plays a log twice as fast. The texts "max" and "0" mean as fast as
+        possible.
 
-    For example, "2" plays a log twice as fast. The texts "max" and "0" mean as fast as
-    possible.
+        Returns:
+            Seconds of the log per second, `math.inf` for as fast as possible.
 
-    Returns:
-        Seconds of the log per second, `math.inf` for as fast as possible.
+        Raises:
+            UsageError: The text is not a rate from `SLOWEST` to `FASTEST`.
+        """
+        if text.strip().lower() == "max":
+            return math.inf
 
-    Raises:
-        UsageError: The text is not a rate from `SLOWEST` to `FASTEST`.
-    """
-    if text.strip().lower() == "max":
-        return math.inf
+        try:
+            rate = float(text)
+        except ValueError:
+            rate = math.nan
 
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = math.nan
-
-    if rate == 0:
-        return math.inf
-    if not SLOWEST <= rate <= FASTEST:
-        raise UsageError(
-            f"--rate, the speed relative to the recorded run, must be from {SLOWEST:g} to "
-            f"{FASTEST:g}, or max, not {text!r}"
-        )
-    return rate
+        if rate == 0:
+            return math.inf
+        if not SLOWEST <= rate <= FASTEST:
+            raise UsageError(
+                f"--rate, the speed relative to the recorded run, must be from {SLOWEST:g} to "
+                f"{FASTEST:g}, or max, not {text!r}"
+            )
+        return rate
 
 
 def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
@@ -138,18 +138,6 @@ LATENESS_LIMIT_US = 100_000
 """Lateness above which all values are counted in one bin. The maximum is still exact."""
 
 
-class LatenessSummary(NamedTuple):
-    """How late messages were published in a replay: median, 99th percentile and maximum.
-
-    The times are in us. If a percentile is above `LATENESS_LIMIT_US`, the histogram does not
-    resolve it. Then it is replaced by the maximum.
-    """
-
-    p50_us: int
-    p99_us: int
-    max_us: int
-
-
 class LatenessHistogram:
     """Counts the published messages of a replay by their lateness after the deadline.
 
@@ -159,6 +147,17 @@ class LatenessHistogram:
     Attributes:
         max_us: Largest lateness, in us.
     """
+
+    class Summary(NamedTuple):
+        """How late messages were published in a replay: median, 99th percentile and maximum.
+
+        The times are in us. If a percentile is above `LATENESS_LIMIT_US`, the histogram does
+        not resolve it. Then it is replaced by the maximum.
+        """
+
+        p50_us: int
+        p99_us: int
+        max_us: int
 
     def __init__(self) -> None:
         self.max_us = 0
@@ -178,7 +177,7 @@ class LatenessHistogram:
         if late_us > self.max_us:
             self.max_us = late_us
 
-    def summary(self) -> LatenessSummary | None:
+    def summary(self) -> Summary | None:
         """Computes the statistics of all messages that were counted.
 
         The p-th percentile is the smallest lateness up to which at least p percent of the
@@ -203,7 +202,7 @@ class LatenessHistogram:
             percentile_us if percentile_us < LATENESS_LIMIT_US else self.max_us
             for percentile_us in percentiles_us
         ]
-        return LatenessSummary(p50_us, p99_us, self.max_us)
+        return self.Summary(p50_us, p99_us, self.max_us)
 
 
 MIN_SLACK_NS = 400_000

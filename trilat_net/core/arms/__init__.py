@@ -1,6 +1,7 @@
-"""Computes how robot arms move: kinematics, dynamics, and the torques that act on them.
+"""Kinematics and dynamics of robot arms, and the external torques that act on them.
 
-There are two models: the planar two-link arm of the paper, and chains of any number of joints,
-for example from a URDF file. The package also contains the torques of the operators (humans or
-programs that move an arm) and of the walls and bodies that an arm touches.
+Two arm models are available: the planar two-link arm of the paper, and serial chains with any
+number of joints, usually read from a URDF file. The package also computes the torques exerted
+by operators (people or programs that move an arm) and by walls and other objects that an arm
+touches.
 """

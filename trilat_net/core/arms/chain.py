@@ -1,37 +1,37 @@
-"""Computes the kinematics and dynamics of a serial chain of revolute and prismatic joints.
+"""Kinematics and dynamics of a serial chain of revolute and prismatic joints.
 
 Symbols: q, qd and qdd are the positions, velocities and accelerations of the n joints. M(q) is
-the inertia matrix, C the Coriolis matrix, G the gravity torque and tau the joint torque. The
-chain starts at the base. The frame of a link moves with the link, and the axis of the joint
-that moves the link is constant in this frame.
+the inertia matrix, C the Coriolis matrix, G the gravity torque and tau the joint torque. Joints
+and links are numbered from the base. The frame of a link moves with the link, so the axis of
+the joint that drives it is constant in that frame.
 
 Each link has ten inertial parameters about the origin of its own frame:
 
     pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz)
 
 Here m is the mass, c the centre of mass, and Ixx to Izz are the moments of inertia. The vector
-theta, shape (10 n,), lists the parameters of all links. All dynamics are linear in theta.
+theta, shape (10 n,), stacks the parameters of all links. The dynamics are linear in theta.
 
 A spatial vector combines a linear part and an angular part at the origin of a frame. The
-Newton-Euler recursion goes from the base to the tip. It computes for link i, whose previous
-link is p:
+Newton-Euler recursion runs from the base to the tip. For link i with parent p, it computes
 
     V_i = X V_p + S qd      W_i = X W_p + S v      A_i = X A_p + S a + V_i x (S v)
     f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))      tau_i = S' f_i
 
-- X transforms spatial vectors from the frame of link p to the frame of link i. S is the axis of
-  the joint as a spatial vector, and I the spatial inertia of the link. The product x is for two
-  velocities, and x* for a velocity and a force.
+- X transforms spatial vectors from the frame of link p to the frame of link i. S is the joint
+  axis as a spatial vector, and I the spatial inertia of the link. The product x takes two
+  velocities, and x* a velocity and a force.
 - V is the velocity of the link. W is the velocity that the link would have if the joints moved
-  at the reference velocities v of a control law. A is its acceleration for the reference
-  accelerations a, and f is the spatial force on the link.
+  at the reference velocities v of a control law. A is the acceleration of the link for the
+  reference accelerations a, and f is the spatial force on the link.
 
-The result is tau = M a + C v + G, in which C depends on qd. The product of V and W is
-symmetric. It corresponds to the Christoffel symbols. Therefore dM/dt - 2 C is skew-symmetric.
+The result is tau = M a + C v + G, in which C depends on qd. Because the product of V and W is
+symmetric, C is the matrix of Christoffel symbols, and dM/dt - 2 C is skew-symmetric.
 
-The adaptive control law needs the product Y' r. Y is the regressor, the matrix for which Y
-theta = tau, and r = qd - v is the filtered error. The product is the gradient of r' tau with
-respect to theta. It is computed link by link with the vector V - W, without the matrix Y.
+The adaptive control law needs the product Y' r, where Y is the regressor (the matrix for which
+Y theta = tau) and r = qd - v is the filtered error. This product is the gradient of r' tau with
+respect to theta. It is computed link by link from the vector V - W, and the matrix Y is never
+formed.
 
 Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors,
 Newton-Euler and composite bodies; G. Niemeyer and J.-J. Slotine, "Performance in adaptive
@@ -39,9 +39,9 @@ manipulator control", Int. J. Robotics Research 10 (1991), for the recursion of 
 law.
 
 Invariant:
-    - Compiled functions allocate no memory. They write their results into the array that holds
-      the data of the joints, one row per joint (see `chain_dtype`).
-    - Each sum has a fixed order, so that results are the same on every machine.
+    - Compiled functions allocate no memory. They write their results into the joint data array,
+      which has one row per joint (see `chain_dtype`).
+    - Sums are evaluated in a fixed order, which makes the results identical on every machine.
 """
 
 from collections.abc import Sequence
@@ -58,30 +58,31 @@ from .elementary import sincos
 
 LINK_PARAMETERS = 10
 COULOMB_SPEED = 0.01
-"""Speed at which the smoothed Coulomb friction has 71 % of its full value, rad/s or m/s."""
+"""Speed at which the smoothed Coulomb friction reaches 71 % of its full value, rad/s or m/s."""
 
 Three = tuple[float, float, float]
 Matrix = tuple[Three, Three, Three]
 Spatial = tuple[Three, Three]
-"""A spatial vector: its linear half and its angular half."""
+"""A spatial vector, as a pair of its linear and its angular part."""
 
 
 class ChainJoint(NamedTuple):
-    """Geometry, drive, friction and stops of one joint of an arm.
+    """Geometry, drive, friction and end stops of one joint.
 
-    The mass and inertia of the link that the joint moves are not included; they are in theta.
+    The mass and inertia of the link that the joint moves are not stored here but in theta.
 
     Attributes:
-        prismatic: True if the joint slides (m, N), False if it turns (rad, N m).
-        axis: Axis of motion in the link's frame, length 1.
-        rotation: Orientation of the link's frame in the previous link's frame at position 0,
+        prismatic: True for a sliding joint (m, N), False for a revolute joint (rad, N m).
+        axis: Axis of motion in the link's frame, a unit vector.
+        rotation: Orientation of the link's frame in the parent's frame at joint position 0,
             three rows.
-        origin_m: Origin of the link's frame in the previous link's frame, m.
+        origin_m: Origin of the link's frame in the parent's frame, m.
         armature_kg_m2: Inertia of the drive at the joint, kg m^2; kg for a prismatic joint.
-        viscous: Friction per speed, N m s/rad or N s/m.
-        coulomb: Friction that hardly depends on the speed, N m or N, see `COULOMB_SPEED`.
-        lower: Position of the lower stop, rad or m; -inf without a stop.
-        upper: Position of the upper stop, rad or m; inf without a stop.
+        viscous: Viscous friction coefficient, N m s/rad or N s/m.
+        coulomb: Dry (Coulomb) friction, nearly independent of speed, N m or N. See
+            `COULOMB_SPEED`.
+        lower: Position of the lower stop, rad or m; -inf if there is no stop.
+        upper: Position of the upper stop, rad or m; inf if there is no stop.
         stop_stiffness: Stiffness of both stops, N m/rad or N/m.
         stop_damping: Damping of both stops, N m s/rad or N s/m.
     """
@@ -114,29 +115,28 @@ _TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 
 @cache
 def chain_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type that stores one joint of a chain of joints.
+    """Returns the NumPy dtype of the data of one joint.
 
-    It contains the constants of the joint and the work space of the algorithms. A link is the
-    body that the joint moves, and its frame moves with it. Names with lin and ang are the
-    linear and the angular part of a spatial vector at the origin of this frame. Positions are
-    in m.
+    Each row holds the constants of a joint and of the link that it moves, together with work
+    space for the algorithms. In field names, lin and ang denote the linear and the angular part
+    of a spatial vector at the origin of the link's frame. Positions are in m.
 
     - Constants: the fields of `ChainJoint` for the axis and the drive; `origin`, the origin of
-      the link's frame in that of the previous link; `slide`, the axis of a prismatic joint in
-      the frame of the previous link, zero for other joints; and the matrices of Rodrigues'
-      formula (`build_chain`): `at_rest` is F, `by_sine` F [a] and `by_cosine` F [a]^2.
-    - Placement: R and p, the orientation and the origin of the link's frame in that of the
-      previous link. `R_base` is the orientation, `p_base` the origin and `axis_base` the axis
-      in the frame of the base.
-    - Motion, as spatial vectors: the velocity V of the link, its velocity W and acceleration A
-      in the reference motion of a control law, and the force f on the link.
-    - Dynamics: `bias`, the torque C qd + G with friction, minus the torque of the stops;
-      `composite`, the ten inertial parameters of the link and all links after it as one rigid
-      body; and M, the row of the inertia matrix.
-    - End effector: `J_lin` and `J_ang`, the column of its Jacobian.
+      the link's frame in the parent's frame; `slide`, the axis of a prismatic joint in the
+      parent's frame, or zero for a revolute joint; and the matrices of Rodrigues' formula (see
+      `build_chain`), namely `at_rest` (F), `by_sine` (F [a]) and `by_cosine` (F [a]^2).
+    - Placement: R and p, the orientation and origin of the link's frame in the parent's frame.
+      `R_base` is the orientation of the link, `p_base` its origin and `axis_base` the joint
+      axis, all in the base frame.
+    - Motion, as spatial vectors: the link velocity V, its velocity W and acceleration A in the
+      reference motion of a control law, and the force f on the link.
+    - Dynamics: `bias`, the torque C qd + G plus friction, minus the torque of the stops;
+      `composite`, the ten inertial parameters of the rigid body formed by this link and all
+      later links; and M, a row of the inertia matrix.
+    - End effector: `J_lin` and `J_ang`, a column of its Jacobian.
 
     Args:
-        joints: Number of joints of the chain, the length of a row of M.
+        joints: Number of joints of the chain, which is the length of a row of M.
     """
     matrices = ("at_rest", "by_sine", "by_cosine", "R", "R_base")
     vectors = ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)
@@ -152,21 +152,23 @@ def chain_dtype(joints: int) -> np.dtype[np.void]:
 
 
 def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
-    """Creates the array with the data of all joints of an arm, on which compiled code works.
+    """Creates the joint data array that the compiled functions operate on.
 
-    The constants of each joint are filled in. Among them are three matrices, with which the
-    rotation R of a joint by the angle q about its axis a needs no matrix product (Rodrigues):
+    The constants of each joint are filled in. They include three matrices that give the
+    rotation R of a joint at angle q about its axis a without a matrix product (Rodrigues'
+    formula):
 
         R = F + sin(q) F [a] + (1 - cos(q)) F [a]^2
 
     Here F is the rotation at q = 0, and [a] is the matrix of the cross product with a.
 
     Args:
-        joints: The joints.
-        width: Number of joints for which the rows have room; by default that of the chain.
+        joints: The joints, starting at the base.
+        width: Number of joints for which each row has space. Defaults to the length of the
+            chain.
 
     Returns:
-        One row per joint, shape (n,), see `chain_dtype`.
+        Array with one row per joint, shape (n,). See `chain_dtype`.
     """
     rows = np.zeros(len(joints), chain_dtype(width or len(joints)))
     row: Row
@@ -194,7 +196,7 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
 
 @leaf
 def read_three(a: Vector) -> Three:
-    """Returns the first three numbers of an array as a tuple, for vector arithmetic in 3D.
+    """Returns the three elements of an array as a tuple, for 3D vector arithmetic.
 
     Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
     control loop.
@@ -207,14 +209,14 @@ def read_three(a: Vector) -> Three:
 
 @leaf
 def put_three(a: Array, values: Three) -> None:
-    """Writes a vector, given as a tuple of three numbers, into an array of length 3.
+    """Copies a tuple of three elements into an array of length 3.
 
     The array is overwritten in place, because compiled code in the control loop must not
     allocate memory.
 
     Args:
-        a: The array, which is changed.
-        values: The three numbers.
+        a: The array to overwrite.
+        values: The three elements.
     """
     x, y, z = values
     a[0] = x
@@ -233,7 +235,7 @@ def dot_product(a: Three, b: Three) -> float:
 
 @leaf
 def cross_product(a: Three, b: Three) -> Three:
-    """Returns the vector product a x b of two 3D vectors, which is perpendicular to both."""
+    """Returns the cross product a x b of two 3D vectors."""
     x = a[1] * b[2] - a[2] * b[1]
     y = a[2] * b[0] - a[0] * b[2]
     z = a[0] * b[1] - a[1] * b[0]
@@ -242,7 +244,7 @@ def cross_product(a: Three, b: Three) -> Three:
 
 @leaf
 def add_vectors(a: Three, b: Three) -> Three:
-    """Returns the sum a + b of two 3D vectors, element by element."""
+    """Returns the sum a + b of two 3D vectors."""
     x = a[0] + b[0]
     y = a[1] + b[1]
     z = a[2] + b[2]
@@ -251,7 +253,7 @@ def add_vectors(a: Three, b: Three) -> Three:
 
 @leaf
 def subtract_vectors(a: Three, b: Three) -> Three:
-    """Returns the difference a - b of two 3D vectors, element by element."""
+    """Returns the difference a - b of two 3D vectors."""
     x = a[0] - b[0]
     y = a[1] - b[1]
     z = a[2] - b[2]
@@ -260,7 +262,7 @@ def subtract_vectors(a: Three, b: Three) -> Three:
 
 @leaf
 def scale_vector(factor: float, a: Three) -> Three:
-    """Returns a 3D vector multiplied by a number, factor * a."""
+    """Returns a 3D vector multiplied by a scalar, factor * a."""
     x = factor * a[0]
     y = factor * a[1]
     z = factor * a[2]
@@ -271,8 +273,8 @@ def scale_vector(factor: float, a: Three) -> Three:
 def rotate_by_matrix(R: Array, a: Three) -> Three:
     """Returns the product R a of a rotation matrix and a 3D vector.
 
-    If R is the orientation of a link in the base frame, a vector given in the axes of the link
-    becomes the same vector in the axes of the base.
+    If R is the orientation of a link in the base frame, this transforms a vector from link
+    coordinates to base coordinates.
 
     Args:
         R: Rotation matrix, shape (3, 3).
@@ -287,9 +289,9 @@ def rotate_by_matrix(R: Array, a: Three) -> Three:
 
 @leaf
 def _rotate_back(R: Array, a: Three) -> Three:
-    """Returns the product R' a: a 3D vector rotated by the inverse of a rotation matrix R.
+    """Returns R' a: a 3D vector rotated by the inverse of the rotation matrix R.
 
-    The inverse of a rotation matrix is its transpose, so no equations need to be solved.
+    The inverse of a rotation matrix is its transpose.
 
     Args:
         R: Rotation matrix, shape (3, 3).
@@ -305,11 +307,11 @@ def _rotate_back(R: Array, a: Three) -> Three:
 def multiply_vector(a: Matrix, b: Three) -> Three:
     """Returns the product of a 3 x 3 matrix `a` and a 3D vector `b`.
 
-    The sums have a fixed order, so that the result has the same bits on every machine.
+    Sums are evaluated in a fixed order, which makes the result bit-identical on every machine.
 
     Args:
-        a: The matrix, three rows of three numbers.
-        b: The vector, three numbers.
+        a: The matrix, three rows of three elements.
+        b: The vector, three elements.
     """
     x, y, z = b
     products = []
@@ -323,8 +325,8 @@ def multiply_vector(a: Matrix, b: Three) -> Three:
 def multiply_matrices(a: Matrix, b: Matrix) -> Matrix:
     """Returns the product a b of two 3 x 3 matrices, each given as three rows.
 
-    The sums have a fixed order, so that the result has the same bits on every machine. The sums
-    of a linear algebra library may differ in the last bit.
+    Sums are evaluated in a fixed order, which makes the result bit-identical on every machine.
+    With a linear algebra library, the last bit could differ.
     """
     columns: Any = zip(*b, strict=True)
     product_columns = [multiply_vector(a, column) for column in columns]
@@ -334,16 +336,16 @@ def multiply_matrices(a: Matrix, b: Matrix) -> Matrix:
 
 @leaf
 def place_joints(chain: RowArray, q: Vector) -> None:
-    """Computes the position and orientation of each link of an arm from the joint positions.
+    """Computes the position and orientation of every link from the joint positions.
 
-    The frame of a link moves with the link. Its rotation R and origin p (m) refer to the frame
-    of the previous link, and are written into the rows of `chain`, one per joint. `build_chain`
-    gives the equation of R. Call this function first after each change of the positions,
-    because most other functions of this module read R and p.
+    The rotation R and the origin p (m) of each link's frame, relative to the parent's frame,
+    are written into the rows of `chain`. The equation for R is given in `build_chain`. Most
+    other functions of this module read R and p, so call this function whenever the positions
+    change.
 
     Args:
-        chain: Data of the joints, one row per joint; written.
-        q: Positions of the joints, shape (n,), rad or m.
+        chain: Joint data, one row per joint; modified.
+        q: Joint positions, shape (n,), rad or m.
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
@@ -364,15 +366,14 @@ def place_joints(chain: RowArray, q: Vector) -> None:
 
 @leaf
 def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
-    """Returns the spatial velocity of a link: that of the previous link plus that of the joint.
+    """Returns the spatial velocity of a link from the velocities of its parent and its joint.
 
-    In the notation of spatial vectors this is X V_p + S rate. Accelerations are transformed in
-    the same way.
+    In spatial notation, this is X V_p + S rate. Accelerations are transformed in the same way.
 
     Args:
-        row: Data of the joint between the two links.
-        linear: Linear part of the previous link's velocity V_p, in the previous link's frame.
-        angular: Angular part of V_p, in the previous link's frame.
+        row: Row of the joint between the two links.
+        linear: Linear part of the parent's velocity V_p, in the parent's frame.
+        angular: Angular part of V_p, in the parent's frame.
         rate: Velocity of the joint, rad/s or m/s.
 
     Returns:
@@ -396,12 +397,12 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
     """Returns the linear and angular momentum of a link about the origin of its frame.
 
-    It is the product I(pi) V, where V is the spatial velocity of the link and I(pi) its spatial
-    inertia.
+    This is the product I(pi) V, where V is the spatial velocity of the link and I(pi) its
+    spatial inertia.
 
     Args:
-        pi: Inertial parameters of the links: per link its mass m, m times its centre of mass,
-            and its moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
+        pi: Inertial parameters of all links. For each link: the mass m, m times the centre of
+            mass, and the moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
         first: Index of the link's first parameter in `pi`.
         linear: Linear velocity of the link's origin, m/s.
         angular: Angular velocity of the link, rad/s.
@@ -434,11 +435,11 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
 def _along_axis(row: Row, linear: Three, angular: Three) -> float:
     """Returns the component of a spatial force along the axis of a joint, S' f.
 
-    A spatial force f is a force together with a torque, and S is the axis. The result is the
-    torque of a revolute joint, N m, or the force of a prismatic (sliding) joint, N.
+    A spatial force f combines a force and a torque, and S is the joint axis. The result is the
+    torque of a revolute joint, N m, or the force of a prismatic joint, N.
 
     Args:
-        row: Data of the joint.
+        row: Row of the joint.
         linear: Linear part of f, the force.
         angular: Angular part of f, the torque.
     """
@@ -449,15 +450,15 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
 
 @leaf
 def friction_torque(row: Row, speed: float) -> float:
-    """Returns the torque with which friction opposes the motion of a joint, N m.
+    """Returns the friction torque that opposes the motion of a joint, N m.
 
         f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
 
-    It increases with the joint velocity v. The second term is a smooth form of dry friction,
-    which would otherwise jump at v = 0 and disturb the integration.
+    The torque increases with the joint velocity v. The second term is a smooth approximation of
+    dry friction; a jump at v = 0 would disturb the integration.
 
     Args:
-        row: Data of the joint, with the coefficients `viscous` and `coulomb`.
+        row: Row of the joint, with the coefficients `viscous` and `coulomb`.
         speed: Velocity v of the joint, rad/s or m/s.
     """
     x = speed / COULOMB_SPEED
@@ -469,14 +470,14 @@ def friction_torque(row: Row, speed: float) -> float:
 
 @leaf
 def _pass_force(row: Row, before: Row) -> None:
-    """Adds the force on a link to the force on the previous link, which has to carry both.
+    """Adds the force on a link to the force on its parent, which has to support both.
 
-    The inverse dynamics add up forces in this way from the last link of an arm to its base. The
-    force and its torque are first transformed to the frame of the previous link.
+    The inverse dynamics accumulates forces in this way from the tip of an arm to its base. The
+    force and its torque are first transformed to the parent's frame.
 
     Args:
-        row: Data of the joint that moves the link.
-        before: Data of the previous joint; changed.
+        row: Row of the joint that moves the link.
+        before: Row of the previous joint; modified.
     """
     R = row.R
     p = read_three(row.p)
@@ -494,19 +495,19 @@ def _pass_force(row: Row, before: Row) -> None:
 def propagate_motion(
     chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a: Vector
 ) -> None:
-    """Computes the velocities and the acceleration of each link, starting at the base.
+    """Computes the velocities and the acceleration of every link, from the base to the tip.
 
-    These are spatial vectors, which combine an angular and a linear part. The velocity V
-    results from qd, the velocity W from v, and the acceleration A from a and gravity. They are
-    written into the rows of the joints, where `inverse_dynamics` and `parameter_gradient` read
-    them. `place_joints` must have been called for the same positions.
+    All of them are spatial vectors, which combine a linear and an angular part. V is the link
+    velocity for qd, W the link velocity for v, and A the link acceleration for a, including
+    gravity. They are stored in the joint rows, where `inverse_dynamics` and
+    `parameter_gradient` read them. `place_joints` must have been called for the same positions.
 
     Args:
-        chain: Data of the joints, one row per joint; written.
-        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
-        qd: Velocities of the joints, shape (n,), rad/s or m/s.
-        v: Reference velocities, by which the Coriolis matrix C is multiplied, shape (n,).
-        a: Reference accelerations, by which the inertia matrix M is multiplied, shape (n,).
+        chain: Joint data, one row per joint; modified.
+        gravity: Gravitational acceleration in the base frame, m/s^2, shape (3,).
+        qd: Joint velocities, shape (n,), rad/s or m/s.
+        v: Reference velocities, which multiply the Coriolis matrix C, shape (n,).
+        a: Reference accelerations, which multiply the inertia matrix M, shape (n,).
     """
     still = (0.0, 0.0, 0.0)
     V_lin = still
@@ -542,9 +543,10 @@ def propagate_motion(
 
 @leaf
 def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
-    """Returns the spatial cross product V x W, the rate at which W changes if it moves with V.
+    """Returns the spatial cross product V x W, the rate of change of W as it moves with V.
 
-    For V = (v, w) and W = (v', w') in (linear, angular) parts it is (w x v' + v x w', w x w').
+    For V = (v, w) and W = (v', w'), with the linear part first, this is (w x v' + v x w', w x
+    w').
     """
     V_lin, V_ang = V
     W_lin, W_ang = W
@@ -557,9 +559,9 @@ def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
 
 @leaf
 def _force_cross(V: Spatial, f: Spatial) -> Spatial:
-    """Returns the spatial cross product V x* f, the rate at which f changes if it moves with V.
+    """Returns the spatial cross product V x* f, the rate of change of f as it moves with V.
 
-    For V = (v, w) and f = (force, torque) it is (w x force, w x torque + v x force).
+    For V = (v, w) and f = (force, torque), this is (w x force, w x torque + v x force).
     """
     V_lin, V_ang = V
     force, torque = f
@@ -574,18 +576,18 @@ def _force_cross(V: Spatial, f: Spatial) -> Spatial:
 def inverse_dynamics(
     chain: RowArray, theta: Vector, v: Vector, a: Vector, torque: Array
 ) -> None:
-    """Computes the joint torque that the reference motion requires.
+    """Computes the joint torque required for the reference motion.
 
         M a + C(q, qd) v + G + armature a + friction(v)
 
     M is the inertia matrix of the links, C the Coriolis matrix, G the gravity torque and
-    `armature` the inertia of the drives. The friction is taken at the reference velocity v and
-    not at qd. With r = qd - v, this gives r' (friction(qd) - friction(v)) >= 0, so the
+    `armature` the inertia of the drives. Friction is evaluated at the reference velocity v
+    instead of qd. With r = qd - v, it follows that r' (friction(qd) - friction(v)) >= 0, so the
     difference from the real friction can only dissipate energy. `propagate_motion` must have
     been called for the same motion.
 
     Args:
-        chain: Data of the joints, one row per joint.
+        chain: Joint data, one row per joint.
         theta: Inertial parameters, ten per link, shape (10 n,).
         v: Reference velocities, shape (n,), rad/s or m/s.
         a: Reference accelerations, shape (n,), rad/s^2 or m/s^2.
@@ -642,23 +644,23 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 
         pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz),
 
-    the mass m, the vector m c with the centre of mass c, and the moments of inertia J. With the
-    linear parts x_lin and y_lin and the angular parts x_ang and y_ang, the term is
+    namely the mass m, the vector m c with the centre of mass c, and the moments of inertia J.
+    With the linear parts x_lin and y_lin and the angular parts x_ang and y_ang, the term is
 
         x' I y = m x_lin' y_lin
                + (m c)' (cross_product(y_lin, x_ang) + cross_product(x_lin, y_ang))
                + x_ang' J y_ang
 
-    The factors of the parameters in this sum are the derivatives with respect to them. J is
-    symmetric. Therefore Ixy, Ixz and Iyz appear in two elements each, and have two products.
+    The coefficients of the parameters in this sum are the derivatives with respect to them.
+    Because J is symmetric, Ixy, Ixz and Iyz each appear in two elements and have two products.
 
     Args:
         factor: Factor of the term.
-        x: A spatial velocity: its linear part in m/s, then its angular part in rad/s.
-        y: A spatial velocity or acceleration, also with its linear part first.
-        first: Index of the link's first parameter, its mass, in `gradient`.
+        x: A spatial velocity: the linear part, m/s, followed by the angular part, rad/s.
+        y: A spatial velocity or acceleration, also with the linear part first.
+        first: Index of the link's first parameter (the mass) in `gradient`.
         gradient: Gradient for all links, shape (10 n,). `factor` times the ten derivatives is
-            added to the entries from `first`, in the order of pi.
+            added to the entries starting at `first`, in the order of pi.
     """
     x_lin, x_ang = x
     y_lin, y_ang = y
@@ -689,14 +691,14 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 def parameter_gradient(chain: RowArray, gradient: Array) -> None:
     """Computes Y' r, which drives the parameter estimate of the adaptive control law.
 
-    Y is the regressor, the matrix for which Y theta is the torque of the links in
-    `inverse_dynamics`, where theta are their inertial parameters. The filtered error r = qd - v
-    is the difference between the velocities qd and the reference velocities v of the joints.
-    `propagate_motion` must have been called for the same qd and v.
+    Y is the regressor: Y theta is the torque of the links in `inverse_dynamics`, where theta is
+    the vector of their inertial parameters. The filtered error r = qd - v is the difference
+    between the velocities qd and the reference velocities v of the joints. `propagate_motion`
+    must have been called for the same qd and v.
 
     With the spatial velocity s = V - W, the product is the gradient of the sum of s' f over all
-    links. The symbols are those at the top of this module: V is the velocity of the link, W its
-    velocity at v, A its reference acceleration, I its spatial inertia and f the force. In
+    links. As in the module docstring, V is the velocity of the link, W its velocity at v, A its
+    reference acceleration, I its spatial inertia and f the force. In
 
         s' f = s' I A + 1/2 s' (V x* I W + W x* I V - I (V x W))
 
@@ -706,8 +708,8 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
         s' f = s' I A - 1/2 (V x s)' I W - 1/2 (W x s)' I V - 1/2 s' I (V x W)
 
     Args:
-        chain: Data of the n joints, one row per joint.
-        gradient: Receives Y' r, ten numbers per link, shape (10 n,).
+        chain: Joint data, one row per joint.
+        gradient: Receives Y' r, ten entries per link, shape (10 n,).
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
@@ -740,16 +742,16 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
 
 @leaf
 def _add_composite(row: Row, before: Row) -> None:
-    """Adds the mass and inertia of a composite body to those of the previous link.
+    """Adds the mass and inertia of a composite body to those of the parent link.
 
-    A composite body is a link together with all links after it, as if they were rigidly
-    connected. The inertia matrix of an arm is computed from such bodies. The parallel-axis
-    theorem moves the inertia to the origin of the previous link; it is written out for the ten
-    parameters of a body (mass, first moments, moments of inertia).
+    A composite body consists of a link and all later links, as if they were rigidly connected.
+    The inertia matrix of an arm is computed from such bodies. The inertia is moved to the
+    origin of the parent link with the parallel axis theorem, written out for the ten parameters
+    of a body (mass, first moments, moments of inertia).
 
     Args:
-        row: Data of the joint that moves the body.
-        before: Data of the previous joint, whose composite body is changed.
+        row: Row of the joint that moves the body.
+        before: Row of the previous joint, whose composite body is modified.
     """
     pi = row.composite
     total = before.composite
@@ -813,14 +815,14 @@ def _add_composite(row: Row, before: Row) -> None:
 
 @leaf
 def mass_matrix(chain: RowArray, theta: Vector) -> None:
-    """Computes the inertia matrix M(q) of the arm, with the inertia of its drives.
+    """Computes the inertia matrix M(q) of the arm, including the inertia of the drives.
 
-    Only the lower triangle of M is written into the field `M` of the rows, because M is
-    symmetric. The method uses composite rigid bodies (Featherstone). `place_joints` must have
-    been called for the same positions.
+    Because M is symmetric, only its lower triangle is written into the field `M` of the rows.
+    The composite-rigid-body algorithm (Featherstone) is used. `place_joints` must have been
+    called for the same positions.
 
     Args:
-        chain: Data of the joints, one row per joint; written.
+        chain: Joint data, one row per joint; modified.
         theta: Inertial parameters, ten per link, shape (10 n,).
     """
     n = chain.shape[0]
@@ -858,11 +860,11 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
 def _stop_torque(row: Row, q: float, qd: float) -> float:
     """Returns the torque of the mechanical stops at the ends of a joint's range, N m.
 
-    A stop acts only beyond the end of the range: a spring and a damper push the joint back, and
-    never pull. Within the range the torque is 0. For a sliding joint, it is a force, N.
+    Beyond the end of the range, a spring and a damper push the joint back, and never pull.
+    Within the range, the torque is 0. For a prismatic joint, the result is a force, N.
 
     Args:
-        row: Data of the joint.
+        row: Row of the joint.
         q: Position of the joint, rad or m.
         qd: Velocity of the joint, rad/s or m/s.
     """
@@ -879,7 +881,7 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
 
 @leaf
 def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector) -> None:
-    """Computes the bias torque, which the motion of the joints requires without acceleration.
+    """Computes the bias torque, which is required even if the joints do not accelerate.
 
         bias = C qd + G + friction - stops
 
@@ -887,9 +889,9 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
     the joint stops. `place_joints` must have been called for the same positions.
 
     Args:
-        chain: Data of the joints, one row per joint. The result is written into `bias`.
+        chain: Joint data, one row per joint. The result is written into `bias`.
         theta: Inertial parameters, shape (10 n,).
-        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        gravity: Gravitational acceleration in the base frame, m/s^2, shape (3,).
         q: Joint positions, shape (n,).
         qd: Joint velocities, shape (n,).
     """
@@ -949,16 +951,16 @@ def put_model(
     M: Array,
     bias: Array,
 ) -> None:
-    """Computes the inertia matrix and the bias torque, for a control law that needs them.
+    """Computes the inertia matrix and the bias torque for control laws that need them.
 
     The bias torque is C qd + G + friction - stops: Coriolis torque, gravity torque and joint
     friction, minus the torque of the stops. `place_joints` must have been called for the same
     positions.
 
     Args:
-        chain: Data of the joints, one row per joint.
+        chain: Joint data, one row per joint.
         theta: Inertial parameters, ten per link, shape (10 n,).
-        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        gravity: Gravitational acceleration in the base frame, m/s^2, shape (3,).
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         M: Receives the inertia matrix, shape (n, n).
@@ -983,7 +985,7 @@ def find_acceleration(
     torque: Vector,
     qdd: Array,
 ) -> None:
-    """Computes the joint accelerations qdd that a torque causes, Eq. (8).
+    """Computes the joint accelerations qdd caused by a torque, Eq. (8).
 
         M qdd = torque - C qd - G - friction + stops
 
@@ -992,9 +994,9 @@ def find_acceleration(
     `place_joints` must have been called for the same positions.
 
     Args:
-        chain: Data of the joints, one row per joint.
+        chain: Joint data, one row per joint.
         theta: Inertial parameters, ten per link, shape (10 n,).
-        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        gravity: Gravitational acceleration in the base frame, m/s^2, shape (3,).
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         torque: Total torque on the joints, shape (n,), N m or N.
@@ -1033,19 +1035,18 @@ def find_acceleration(
 
 @leaf
 def place_end_effector(chain: RowArray, tip: Vector) -> Three:
-    """Computes the pose of the end effector, its Jacobian and the orientations of the links.
+    """Computes the position of the end effector, its Jacobian, and the link orientations.
 
-    All results are in the axes of the base. Except for the position of the end effector, they
-    are written into the data of the joints:
+    All results are expressed in the base frame. The position of the end effector is returned;
+    the other results are written into the joint rows:
 
-    - `J_lin` and `J_ang`: the column of the Jacobian for this joint, which gives the linear and
-      the angular velocity of the end effector per velocity of the joint.
+    - `J_lin` and `J_ang`: the column of the Jacobian for this joint, which is the linear and
+      angular velocity of the end effector per unit joint velocity.
     - `R_base`: the orientation of the link that the joint moves.
     - `p_base` and `axis_base`: the position, in m, and the axis of the joint.
 
     Args:
-        chain: Data of the joints, one row per joint. `place_joints` must have been called
-            before.
+        chain: Joint data, one row per joint. `place_joints` must have been called before.
         tip: Position of the end effector in the last link's frame, m, shape (3,).
 
     Returns:

@@ -1,7 +1,7 @@
-"""Computes torques, poses and energies of a chain of joints, for programs in plain Python.
+"""Torques, poses and energies of a chain of joints, for use from plain Python.
 
-The functions of `chain` work on the array of a chain's joints, in which each of them finds the
-results of the one before. `ChainDynamics` calls them in the right order, for one pose or many.
+The functions of `chain` share one joint data array and depend on each other's results.
+`ChainDynamics` calls them in the right order, for one pose or for many.
 """
 
 import numpy as np
@@ -39,12 +39,12 @@ def _put_torques(
     a: Array,
     torque: Array,
 ) -> None:
-    """Writes the joint torques that a motion requires in each of K poses into `torque`.
+    """Writes the joint torques required for a motion in each of K poses into `torque`.
 
-    The torque is M a + C(q, qd) v + G + armature a + friction(v), with the inertia matrix M,
-    the Coriolis matrix C, the gravity torque G and the inertia of the drives (armature). Joint
-    arrays have the shape (K, n). theta has the shape (K, 10 n), or (1, 10 n) if all poses share
-    it.
+    The torque is M a + C(q, qd) v + G + armature a + friction(v), where M is the inertia
+    matrix, C the Coriolis matrix, G the gravity torque and `armature` the inertia of the
+    drives. Joint arrays have the shape (K, n). theta has the shape (K, 10 n), or (1, 10 n) if
+    all poses share the same parameters.
     """
     last = theta.shape[0] - 1
     for k in range(q.shape[0]):
@@ -78,8 +78,8 @@ def _put_gradients(
 ) -> None:
     """Writes Y'r for each of K poses into `gradient`, shape (K, 10 n).
 
-    Y'r is the direction in which the adaptive law changes the parameter estimates, with the
-    regressor Y and the velocity error r = qd - v. The motion has the shape (K, n).
+    Y'r, where Y is the regressor and r = qd - v the velocity error, is the direction in which
+    the adaptive law changes the parameter estimates. The motion arrays have the shape (K, n).
     """
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
@@ -106,9 +106,9 @@ def _put_end_effectors(
 ) -> None:
     """Writes the end effector's position and Jacobian, and the potential energy, in K poses.
 
-    The results go into `position`, shape (K, 3), `J`, shape (K, 6, n), and `energy`, shape
-    (K,). The potential energy of a link is -g'(m p + R mc), with its mass m and its first
-    moment mc, and its position p and orientation R in the base's frame.
+    The results are written into `position`, shape (K, 3), `J`, shape (K, 6, n), and `energy`,
+    shape (K,). The potential energy of a link is -g'(m p + R mc), where m is its mass, mc its
+    first moment, and p and R are its position and orientation in the base frame.
     """
     n = chain.shape[0]
     g = read_three(gravity)
@@ -146,12 +146,12 @@ class ChainDynamics:
     """Dynamics and kinematics of a chain of n joints with known inertial parameters.
 
     The parameters theta determine the inertia matrix M, the Coriolis matrix C and the gravity
-    torque G of the links. The inertia of the drives (armature) and the friction of the joints
-    are settings of the joints.
+    torque G of the links. The inertia of the drives (armature) and the friction are taken from
+    the joints.
 
     Args:
         chain: Joints, gravity and end effector.
-        theta: Parameters of the links, shape (10 n,), see `chain`.
+        theta: Parameters of the links, shape (10 n,). See `chain`.
     """
 
     def __init__(self, chain: ChainSetup, theta: Array) -> None:
@@ -164,7 +164,7 @@ class ChainDynamics:
     def compute_torque(
         self, q: Array, qd: Array, v: Array, a: Array, theta: Array | None = None
     ) -> Array:
-        """Returns the joint torques that a motion requires in each of K poses.
+        """Returns the joint torques required for a motion, in each of K poses.
 
         The torque is M a + C(q, qd) v + G + armature a + friction(v).
 
@@ -173,11 +173,11 @@ class ChainDynamics:
             qd: Joint velocities, shape (K, n), in rad/s.
             v: Reference velocities, shape (K, n), in rad/s.
             a: Reference accelerations, shape (K, n), in rad/s^2.
-            theta: Parameters in place of those of the chain, for example estimates, shape
+            theta: Parameters to use instead of those of the chain, for example estimates. Shape
                 (K, 10 n), or (1, 10 n) if all poses share them.
 
         Returns:
-            Torque, shape (K, n), in N m.
+            Joint torques, shape (K, n), in N m.
         """
         if theta is None:
             theta = self._theta[np.newaxis]
@@ -197,17 +197,17 @@ class ChainDynamics:
     def compute_gradient(self, q: Array, qd: Array, v: Array, a: Array) -> Array:
         """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
 
-        Y is the regressor: the torque that a motion requires is Y times the parameters of the
-        links. Y' is its transpose, and r = qd - v the velocity error.
+        Y is the regressor: Y theta is the torque required for a motion, where theta is the
+        parameter vector. Y' is the transpose of Y, and r = qd - v the velocity error.
 
         Args:
             q: Joint angles in K poses, shape (K, n), in rad.
             qd: Joint velocities, shape (K, n), in rad/s.
-            v: Velocities that the joints should have, shape (K, n), in rad/s.
-            a: Accelerations that the joints should have, shape (K, n), in rad/s^2.
+            v: Reference velocities, shape (K, n), in rad/s.
+            a: Reference accelerations, shape (K, n), in rad/s^2.
 
         Returns:
-            Gradient Y'r with respect to the 10 n parameters, shape (K, 10 n).
+            Gradient with respect to the 10 n parameters, shape (K, 10 n).
         """
         gradient = np.zeros((len(q), LINK_PARAMETERS * len(self._rows)))
         _put_gradients(
@@ -224,16 +224,15 @@ class ChainDynamics:
     def place(self, q: Array) -> tuple[Array, Array, Array]:
         """Computes the end effector's position and Jacobian, and the potential energy.
 
-        The Jacobian is the matrix from joint velocities to the velocity of the end effector.
-        Positions are in the frame of the base. K poses are evaluated at once.
+        All positions are given in the base frame. K poses are evaluated in one call.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
 
         Returns:
             Position of the end effector, shape (K, 3), in m.
-            Its Jacobian, with three rows for the velocity and three for the angular velocity,
-            shape (K, 6, n).
+            Jacobian of the end effector: three rows for the linear and three for the angular
+                velocity, shape (K, 6, n).
             Potential energy due to gravity, shape (K,), in J.
         """
         poses, joints = q.shape
@@ -255,7 +254,7 @@ class ChainDynamics:
     def place_points(self, q: Array) -> Array:
         """Returns the positions of base, joints and end effector in each of K poses.
 
-        Lines between successive points are the links of the arm.
+        Connecting successive points with lines draws the links of the arm.
 
         Args:
             q: Joint angles, shape (K, n), in rad.
@@ -279,7 +278,7 @@ class ChainDynamics:
     def find_orientation(self, q: Vector) -> Three:
         """Returns the orientation of the end effector in one pose as a rotation vector.
 
-        The direction of the vector is the axis, and its length the angle in rad.
+        The direction of the vector is the rotation axis, and its length is the angle in rad.
 
         Args:
             q: Joint angles, shape (n,), in rad.
@@ -290,15 +289,13 @@ class ChainDynamics:
         return relative_rotation(self._rows[-1]["R_base"], self._tip_rotation.T)
 
     def find_inertia(self, q: Vector) -> Array:
-        """Returns the inertia matrix M(q) in one pose, including the drives.
-
-        Multiplied by the joint accelerations, it gives the torques that accelerate the arm.
+        """Returns the inertia matrix M(q) in one pose, including the inertia of the drives.
 
         Args:
-            q: Joint angles in rad, or m for a prismatic joint, shape (n,).
+            q: Joint positions, rad (m for a prismatic joint), shape (n,).
 
         Returns:
-            The symmetric matrix, shape (n, n), in kg m^2 for rotating joints.
+            The symmetric matrix, shape (n, n), in kg m^2 for revolute joints.
         """
         place_joints(self._rows, np.asarray(q, dtype=np.float64))
         mass_matrix(self._rows, self._theta)
@@ -308,15 +305,15 @@ class ChainDynamics:
         return M
 
     def find_acceleration(self, q: Array, qd: Array, torque: Array) -> Array:
-        """Returns the joint accelerations that a torque causes in one pose.
+        """Returns the joint accelerations caused by a torque in one pose.
 
         Args:
             q: Joint angles, shape (n,), in rad.
             qd: Joint velocities, shape (n,), in rad/s.
-            torque: Torque that acts ON the joints, shape (n,), in N m.
+            torque: Torque ON the joints, shape (n,), in N m.
 
         Returns:
-            Accelerations, shape (n,), in rad/s^2.
+            Joint accelerations, shape (n,), in rad/s^2.
         """
         acceleration = np.zeros_like(q)
         place_joints(self._rows, q)

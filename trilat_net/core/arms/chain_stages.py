@@ -1,13 +1,13 @@
-"""Computes the parts of a control period that depend on the arm, for an arm of n joints.
+"""The parts of a control period that depend on the arm model, for an arm with n joints.
 
 `kernel` computes a control period (tick) in eight stages. Some of them, such as the torque of
-the control law, need the dynamics of the arm. For an arm that is a chain of joints, this module
-computes these stages by recursions from joint to joint. The argument `chain` holds one row of
-numbers per joint, described in `chain_dtype`.
+the control law, need the dynamics of the arm. This module implements these stages for a serial
+chain, using recursions from joint to joint. The argument `chain` holds one row per joint,
+described in `chain_dtype`.
 
 Invariant:
-    - `two_link_stages` has the same functions for the planar two-link arm, and `kernel` calls
-      the functions of one module or the other.
+    - `two_link_stages` provides the same functions for the planar two-link arm. `kernel` uses
+      one module or the other.
 """
 
 from math import isfinite
@@ -33,16 +33,15 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def place_chain(s: Row, chain: RowArray) -> None:
-    """Updates the pose of every link of an arm and, in task space, of its end effector.
+    """Updates the pose of every link and, in task space, the pose of the end effector.
 
-    In task space, the arms follow each other's end effectors instead of their joint angles.
-    Call this function after each change of the joint positions, because the other functions of
-    this module use the poses.
+    Call this function whenever the joint positions change, because the other functions of this
+    module use the poses.
 
     Args:
-        s: State of the site (the process that runs the arm). If the site works in task space,
-            the pose of the end effector is written into it.
-        chain: Data of the joints, one row per joint; the frames are written into it.
+        s: State of the site. In task space (arms follow each other's end effectors instead of
+            joint angles), the end effector pose is written into it.
+        chain: Joint data, one row per joint; the frames are updated.
     """
     place_joints(chain, s.q)
     if s.task:
@@ -51,17 +50,16 @@ def place_chain(s: Row, chain: RowArray) -> None:
 
 @leaf
 def update_errors(s: Row, chain: RowArray) -> None:
-    """Computes the tracking errors of a chain, and the reference motion of its control law.
+    """Computes the tracking errors of a chain and the reference motion of its control law.
 
-    These are the errors e of the position and ed of the velocity, the filtered error r, and the
-    reference velocity v and acceleration a. For the adaptive law, the product Y' r is computed
-    as well. It drives the estimate of the dynamic parameters; Y is the regressor of the arm's
-    dynamics.
+    The results are the position error e, the velocity error ed, the filtered error r, and the
+    reference velocity v and acceleration a. For the adaptive law, the product Y' r (Y is the
+    regressor of the arm's dynamics) is also computed; it drives the estimate of the dynamic
+    parameters.
 
     Args:
-        s: State of the site (the process that runs the arm); the results are written into it.
-        chain: Data of the joints, one row per joint. `place_chain` must have been called
-            before.
+        s: State of the site; the results are written into it.
+        chain: Joint data, one row per joint. `place_chain` must have been called before.
     """
     if s.task:
         update_task_errors(s)
@@ -81,8 +79,8 @@ def _update_joint_errors(s: Row, joints: int) -> None:
     law acts.
 
     Args:
-        s: State of the site (the process that runs the arm), with the angles q, velocities qd,
-            the reference q_des with its rate qd_des, and the gain Lambda, 1/s; written.
+        s: State of the site, with the angles q, the velocities qd, the reference q_des and its
+            rate qd_des, and the gain Lambda, 1/s; modified.
         joints: Number of joints.
     """
     for i in range(joints):
@@ -99,12 +97,11 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
         theta_hat <- theta_hat - gain_s Gamma Y' r, limited to lower and upper bounds
 
-    Here theta_hat is the estimate of the parameters, such as masses. Gamma is the diagonal gain
-    of the adaptation, Y the regressor of the arm's dynamics, and r the filtered tracking error.
+    Here theta_hat is the estimate of parameters such as masses, Gamma the diagonal matrix of
+    adaptation gains, Y the regressor of the arm's dynamics, and r the filtered tracking error.
 
     Args:
-        s: State of the site (the process that runs the arm), which contains theta_hat and
-            Gamma.
+        s: State of the site, which contains theta_hat and Gamma.
         gain_s: Duration of the step, s.
         Yr: The product Y' r, shape (P,) for P parameters.
     """
@@ -116,16 +113,15 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row, chain: RowArray) -> None:
-    """Computes the motor torque of a built-in control law, limited to the range of the motors.
+    """Computes the motor torque of a built-in control law, limited to the motors' range.
 
-    The law is either the adaptive law or a law that compensates a known gravity torque
-    (`control.damped_torque`). The adaptive law includes its robust term, a bounded torque
-    against disturbances.
+    The law is either the adaptive law, including its robust term (a bounded torque against
+    disturbances), or a law that compensates for a known gravity torque
+    (`control.damped_torque`).
 
     Args:
-        s: State of the site (the process that runs the arm); the torque is written into it.
-        chain: Data of the joints, one row per joint. `place_chain` must have been called
-            before.
+        s: State of the site; the torque is written into it.
+        chain: Joint data, one row per joint. `place_chain` must have been called before.
     """
     if s.law == _ADAPTIVE:
         inverse_dynamics(chain=chain, theta=s.theta_hat, v=s.v, a=s.a, torque=s.tau)
@@ -160,14 +156,14 @@ def update_torque(s: Row, chain: RowArray) -> None:
 
 @leaf
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
-    """Computes the torque that holds the chain against gravity, for the given parameters.
+    """Computes the torque that holds the chain against gravity, for given parameters.
 
-    This is the torque of the inverse dynamics without motion. `place_joints` must have been
-    called for the present positions.
+    This is the inverse dynamics at zero velocity and acceleration. `place_joints` must have
+    been called for the current positions.
 
     Args:
-        s: State of the site (the process that runs the arm).
-        chain: Data of the joints, one row per joint.
+        s: State of the site.
+        chain: Joint data, one row per joint.
         theta: Inertial parameters, shape (10 n,).
         torque: Receives the torque, shape (n,), N m.
     """
@@ -178,13 +174,14 @@ def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
-    """Computes the joint torque of gravity on a simulated arm, with its true masses.
+    """Computes the gravity torque at the joints of a simulated arm, using its true masses.
 
-    The controller may not know these masses; `put_gravity` takes the parameters as an argument.
+    The controller may not know these masses. `put_gravity` takes the parameters as an argument
+    instead.
 
     Args:
-        s: Settings of the site (the process that runs the arm), with the parameters.
-        chain: Data of the n joints, one row per joint; their frames are updated.
+        s: Settings of the site, including the true parameters.
+        chain: Joint data, one row per joint; the frames are updated.
         q: Joint positions, shape (n,), rad or m.
         torque: Receives the gravity torque, shape (n,), N m.
     """
@@ -194,17 +191,15 @@ def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None
 
 @leaf
 def update_model(s: Row, chain: RowArray) -> None:
-    """Computes the model of a chain of joints that a control law written by a user may read.
+    """Computes the dynamic model that a user-written control law can read, for a chain.
 
-    The model consists of the gravity torque G. If the law asks for more, the model also
-    contains the inertia matrix M and the bias torque. The bias torque is C qd + G plus
-    friction, minus the torque of the joint stops, where C is the Coriolis matrix and qd are the
-    joint velocities.
+    The model always contains the gravity torque G. On request it also contains the inertia
+    matrix M and the bias torque, which is C qd + G plus friction, minus the torque of the joint
+    stops. C is the Coriolis matrix, and qd are the joint velocities.
 
     Args:
-        s: State of the site (the process that runs the arm); the model is written into it.
-        chain: Data of the joints, one row per joint. `place_joints` must have been called
-            before.
+        s: State of the site; the model is written into it.
+        chain: Joint data, one row per joint. `place_joints` must have been called before.
     """
     put_gravity(s, chain, s.known, s.G)
     if s.needs_model != 0:
@@ -226,17 +221,15 @@ def put_source_torque(
 ) -> None:
     """Computes the joint torque that operators and environments exert on an arm.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    Some of them are sampled: their torque is evaluated once per period of the control loop, and
-    is constant until the next period. All others act continuously. One call covers one of the
-    two groups.
+    Some of them are sampled: their torque is evaluated once per control period and held
+    constant. All others act continuously. One call covers one of the two groups.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: Settings of the site (the process that runs the arm).
-        chain: Data of the n joints, one row per joint; their frames are updated.
+        s: Settings of the site.
+        chain: Joint data, one row per joint; the frames are updated.
         state: Joint positions, followed by joint velocities, shape (2 n,).
-        actors: Operators and environments, one row for each.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
         sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
         torque: Receives the torque on the arm, shape (n,), N m.
@@ -262,15 +255,14 @@ def update_external_torque(
 ) -> None:
     """Computes the torque that operators and environments exert on the arm at time t.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    The row `s` of the arm receives the total torque, the part of it that stays constant until
-    the next period of the control loop, and the largest force of a wall.
+    The total torque, the part of it that is held constant until the next control period, and
+    the largest wall force are written into `s`.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: State of the site (the process that runs the arm); written.
-        chain: Data of the joints, one row per joint; their frames are updated.
-        actors: Operators and environments, one row for each.
+        s: State of the site; modified.
+        chain: Joint data, one row per joint; the frames are updated.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     place_joints(chain, s.q)
@@ -311,15 +303,15 @@ def put_stage_torque(
     """Computes the torque of operators and environments at a stage of the integrator.
 
     The Runge-Kutta method evaluates the accelerations of the arm four times per control period,
-    at four states (stages). Walls and springs act continuously, so each stage needs their
-    torque at its own time and position.
+    at four states (stages). Since walls and springs act continuously, their torque is needed at
+    the time and position of each stage.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
-        s: State of the site (the process that runs the arm), with the positions `stage_q` and
-            velocities `stage_qd` of the stage; `stage_torque` is written.
-        chain: Data of the joints, one row per joint, placed at the angles `stage_q`.
-        actors: Operators and environments, one row for each.
+        s: State of the site, with the positions `stage_q` and velocities `stage_qd` of the
+            stage; `stage_torque` is written.
+        chain: Joint data, one row per joint, placed at the angles `stage_q`.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     put_torque_on_chain(
@@ -341,13 +333,12 @@ def put_stage_acceleration(s: Row, chain: RowArray) -> None:
 
     The Runge-Kutta method evaluates the accelerations at four stages per control period. The
     total torque is the sum of the motor torque u, which is constant during the period, and the
-    torque of operators (models of persons) and environments (walls, dampers) at this stage.
+    torque of operators and environments at this stage.
 
     Args:
-        s: State of the site (the process that runs the arm), with the positions `stage_q`,
-            velocities `stage_qd` and external torques `stage_torque` of the stage. The
-            accelerations are written into `stage_qdd`.
-        chain: Data of the joints, one row per joint, placed at the angles `stage_q`.
+        s: State of the site, with the positions `stage_q`, velocities `stage_qd` and external
+            torques `stage_torque` of the stage. The accelerations are written into `stage_qdd`.
+        chain: Joint data, one row per joint, placed at the angles `stage_q`.
     """
     for i in range(chain.shape[0]):
         s.stage_torque[i] += s.u[i]
@@ -366,17 +357,17 @@ def put_stage_acceleration(s: Row, chain: RowArray) -> None:
 def _put_acceleration(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the external torques and then the joint accelerations for an integrator stage.
+    """Computes the external torques and the joint accelerations at an integrator stage.
 
     A stage is one of the four states at which the Runge-Kutta method evaluates the
     accelerations of the arm in a control period.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
-        s: State of the site (the process that runs the arm), with the positions `stage_q` and
-            velocities `stage_qd` of the stage. The accelerations are written into `stage_qdd`.
-        chain: Data of the joints, one row per joint.
-        actors: Operators and environments, one row for each.
+        s: State of the site, with the positions `stage_q` and velocities `stage_qd` of the
+            stage. The accelerations are written into `stage_qdd`.
+        chain: Joint data, one row per joint.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     # The torques and the dynamics depend on the positions of the links.
@@ -387,7 +378,7 @@ def _put_acceleration(
 
 @leaf
 def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
-    """Completes a stage of the Runge-Kutta method, and prepares the next stage.
+    """Completes a stage of the Runge-Kutta method and prepares the next one.
 
     The method integrates the joint positions q and velocities qd over a period h. A stage is
     one of its four evaluations of the derivatives (qd, qdd), where qdd is the acceleration:
@@ -395,17 +386,17 @@ def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
         q(t + h) = q(t) + h/6 (qd_1 + 2 qd_2 + 2 qd_3 + qd_4)        and the same for qd, qdd
         q_{n+1}  = q(t) + ahead_s qd_n                               and the same for qd, qdd
 
-    The first line is the result. This function adds up the sum in its brackets. The second line
-    is the state at which stage n + 1 evaluates the derivatives.
+    The first line is the result; this function accumulates the sum in parentheses. The second
+    line is the state at which stage n + 1 evaluates the derivatives.
 
     Args:
-        s: State of the site (the process that runs the arm). `q` and `qd` are the state at the
-            beginning of the period. `stage_q`, `stage_qd` and `stage_qdd` belong to this stage;
-            the first two are replaced by the state of the next stage. The sums `sum_qd` and
-            `sum_qdd` are updated.
+        s: State of the site. `q` and `qd` are the state at the beginning of the period.
+            `stage_q`, `stage_qd` and `stage_qdd` belong to this stage; the first two are
+            replaced by the state of the next stage. The sums `sum_qd` and `sum_qdd` are
+            updated.
         joints: Number of joints.
         weight: Weight of this stage in the sums: 1 or 2, in sixths.
-        ahead_s: Time of the next stage after the beginning of the period, s.
+        ahead_s: Time from the beginning of the period to the next stage, s.
     """
     for i in range(joints):
         s.sum_qd[i] += weight * s.stage_qd[i]
@@ -417,13 +408,13 @@ def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
 
 @leaf
 def begin_stages(s: Row, joints: int) -> None:
-    """Prepares the first of the four stages of the Runge-Kutta method in a control period.
+    """Prepares the first of the four Runge-Kutta stages of a control period.
 
-    The first stage is the present state of the arm: its positions and velocities are copied,
-    and the sums of the derivatives are set to zero.
+    The first stage starts from the current positions and velocities of the arm, and the sums of
+    the derivatives are reset to zero.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         joints: Number of joints.
     """
     for i in range(joints):
@@ -435,15 +426,14 @@ def begin_stages(s: Row, joints: int) -> None:
 
 @leaf
 def end_stages(h_s: float, s: Row, joints: int) -> bool:
-    """Completes the Runge-Kutta method: computes the motion at the end of the control period.
+    """Completes the Runge-Kutta method: computes the state at the end of the control period.
 
         q(t + h) = q(t) + h/6 sum_qd,    qd(t + h) = qd(t) + h/6 sum_qdd
 
     Args:
         h_s: The period h, s.
-        s: State of the site (the process that runs the arm), with the weighted sums of the
-            velocities and accelerations of all stages. Positions q and velocities qd are
-            written.
+        s: State of the site, with the weighted sums of the velocities and accelerations of all
+            stages. Positions q and velocities qd are written.
         joints: Number of joints.
 
     Returns:
@@ -476,17 +466,16 @@ def advance_arm(
 ) -> bool:
     """Simulates the motion of the arm over one period of the control loop.
 
-    The motor torque is constant over the period. The method is the classical Runge-Kutta method
-    of fourth order. The joint positions and velocities at the end of the period are written
-    into the state of the site.
+    The motor torque is constant over the period. Uses the classical fourth-order Runge-Kutta
+    method, and writes the joint positions and velocities at the end of the period into the
+    state of the site.
 
     Args:
         t_s: Time at the beginning of the period, in s since the start of the session.
         h_s: The period, s.
-        s: State of the site (the process that runs the arm), with the motor torque `u`;
-            written.
-        chain: Data of the joints, one row per joint.
-        actors: Operators and environments, one row for each.
+        s: State of the site, with the motor torque `u`; modified.
+        chain: Joint data, one row per joint.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:

@@ -1,17 +1,17 @@
-"""Computes sine, cosine and hyperbolic tangent with the same bits on every machine.
+"""Sine, cosine and hyperbolic tangent with bit-identical results on every machine.
 
-The functions of the C library differ in the last bit from one platform to the next. A run that
-is executed again from its log on another machine would then differ too. The functions of this
-module give the same bits everywhere.
+The functions of the C library differ in the last bit between platforms, so a run repeated from
+its log on another machine would differ too. The functions of this module give the same bits
+everywhere.
 
 - The angle is reduced by multiples of pi/2, which is stored in three parts (Cody and Waite,
   "Software Manual for the Elementary Functions", 1980).
-- The polynomials of sine and cosine, for up to an eighth of a turn in either direction, and the
-  rational functions of the hyperbolic tangent are those of S. Moshier's Cephes library.
+- The polynomials for sine and cosine, valid up to an eighth of a turn in either direction, and
+  the rational functions for the hyperbolic tangent are those of S. Moshier's Cephes library.
 
 Invariant:
-    - All results are sums, products and quotients in a fixed order, without the mathematics
-      library of the platform. An arm therefore moves alike on each machine with IEEE doubles.
+    - All results are sums, products and quotients in a fixed order. The platform's mathematics
+      library is not used. An arm therefore moves identically on all machines with IEEE doubles.
 """
 
 import math
@@ -25,16 +25,18 @@ _PART_1 = 1.5707963267341256
 _PART_2 = 6.077100506303966e-11
 _PART_3 = 2.0222662487959506e-21
 LARGEST_RAD = 2.0**30
-"""Largest angle, rad. Above it, a double resolves angles to only a tenth of a microradian."""
+"""Largest supported angle, rad. Beyond it, a double resolves angles only to a tenth of a
+microradian.
+"""
 
 
 @leaf
 def sincos(x: float) -> tuple[float, float]:
-    """Computes the sine and the cosine of an angle in rad, with equal bits on every machine.
+    """Computes the sine and cosine of an angle in rad, bit-identical on every machine.
 
-    The absolute error is at most 2^-52. For angles beyond 1e5 rad, the rounding of the angle
-    itself causes an error of similar size. Both results are NaN if the angle is not finite or
-    is beyond `LARGEST_RAD`.
+    The absolute error is at most 2^-52. Beyond 1e5 rad, rounding of the angle itself causes an
+    error of similar size. Both results are NaN if the angle is not finite or its magnitude
+    exceeds `LARGEST_RAD`.
     """
     # The nearest quarter turn, and the angle y from there. `round_down` returns a float, so
     # that computing y need not wait for conversions to an integer and back.
@@ -70,16 +72,16 @@ def sincos(x: float) -> tuple[float, float]:
 
 _LOG_2_HIGH = 6.93145751953125e-1
 _LOG_2_LOW = 1.42860682030941723212e-6
-"""The natural logarithm of 2 in two parts. The first part has few bits."""
+"""The natural logarithm of 2, split into two parts. The first part has few bits."""
 _LOG_2_OF_E = 1.4426950408889634
 _SMALL = 0.625
 _LARGE = 20.0
-"""For arguments from this value on, the hyperbolic tangent is 1 to the last bit."""
+"""Argument above which the hyperbolic tangent is 1 to the last bit."""
 
 
 @leaf
 def tanh(x: float) -> float:
-    """Returns the hyperbolic tangent, with equal bits on every machine; NaN for NaN.
+    """Returns the hyperbolic tangent, bit-identical on every machine (NaN for NaN).
 
     The error is at most two units in the last place. The method and the coefficients of all
     polynomials are those of Cephes (`tanh` and `exp`). Arguments with |x| < 0.625 use a

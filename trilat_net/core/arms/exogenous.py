@@ -1,18 +1,18 @@
-"""Computes the torques that operators and environments exert on an arm.
+"""Torques that operators and environments exert on an arm.
 
-An operator is a human or a program that moves the arm, for example a model of a human hand. An
-environment is, for example, a wall that the arm touches. The code calls both of them actors,
-because their torque is computed in the same way.
+An operator is a person or program that moves the arm, for example a model of a human hand. An
+environment is an object that the arm touches, for example a wall. The code calls both of them
+actors, because their torques are computed in the same way.
 
 Sign: This module computes the torque ON the arm. Records and the equations of the control laws
-use tau_x, the negative of this torque. The total torque of the joints is tau - tau_x, where tau
-is the torque of the motors.
+use tau_x, the negative of this torque. The total joint torque is tau - tau_x, where tau is the
+motor torque.
 
 Invariant:
-    - The torque depends on time and on the state of the arm. Therefore it is computed anew at
-      each evaluation of the integrator, several times per period of the control loop.
-    - An actor that is marked `sampled` is evaluated once per period, and its torque is then
-      constant. A digital haptic device renders a wall in this way.
+    - The torque depends on time and on the state of the arm. It is therefore recomputed at each
+      evaluation of the integrator, several times per control period.
+    - An actor marked as `sampled` is evaluated once per period, and its torque is then held
+      constant. This is how a digital haptic device renders a wall.
 """
 
 import math
@@ -34,18 +34,17 @@ from .two_link_arm import end_effector_jacobian, forward_kinematics
 class TorqueKind(IntEnum):
     """The kinds of operators and environments.
 
-    - PULSE is a scripted torque, smooth at both ends.
-    - HAND and TASK_HAND are a spring and a damper towards a target that moves along a
-      minimum-jerk path, of the joints or of the end effector.
+    - PULSE is a scripted torque with a smooth start and end.
+    - HAND and TASK_HAND are a spring and a damper that pull the joints or the end effector
+      towards a target on a minimum-jerk path.
     - RECORDED interpolates a table of torques.
-    - VISCOUS resists motion of the joints.
+    - VISCOUS damps the motion of the joints.
     - WALL pushes the end effector out of a half-space, and never pulls.
-    - CHIRP is a sine whose frequency changes linearly with time, in repeated sweeps.
-    - MULTISINE is a sum of sines with the same amplitude.
-    - OWN_JOINTS and OWN_TIP call a user's compiled function, of the joints or of the end
-      effector.
-    - LIVE_TIP and LIVE_JOINT are a spring and a damper towards a target that a person moves
-      during the run; LIVE_FORCE is a force that a person sets, see `live_hand`.
+    - CHIRP is a repeated sweep: a sine whose frequency changes linearly with time.
+    - MULTISINE is a sum of sines of equal amplitude.
+    - OWN_JOINTS and OWN_TIP call a user's compiled function for the joints or the end effector.
+    - LIVE_TIP and LIVE_JOINT are a spring and a damper that pull towards a target moved by a
+      person during the run. LIVE_FORCE is a force set by a person. See `live_hand`.
     """
 
     PULSE = 0
@@ -64,48 +63,46 @@ class TorqueKind(IntEnum):
 
 
 SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
-"""The kinds whose torque is a function of time alone."""
+"""Kinds whose torque depends only on time."""
 LIVE_KINDS = (TorqueKind.LIVE_TIP, TorqueKind.LIVE_FORCE, TorqueKind.LIVE_JOINT)
-"""The kinds that act only while a hand holds the arm.
+"""Kinds that act only while a hand holds the arm.
 
-Their numbers are the largest, so
-compiled functions can recognise them by `>=`.
+They have the largest numbers, so compiled functions can recognise them with `>=`.
 """
 OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
-"""The kinds that call a user's function."""
+"""Kinds that call a user's function."""
 
 
 class TorqueSource(NamedTuple):
-    """Settings of one operator or environment, which exerts a torque on an arm.
+    """Settings of one operator or environment that exerts a torque on an arm.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    `kind` decides which of the other settings are used, and what the vectors `a` and `b` mean.
-    For a wall, for example, they are a point and a normal; for an operator, start and target.
+    `kind` determines which of the other settings are used, and what the vectors `a` and `b`
+    mean. For a wall they are a point and a normal; for an operator, the start and the target.
 
     Attributes:
         kind: The kind of operator or environment.
         start_s: Start of the action, s since the start of the session.
         end_s: End of the action, s.
-        move_start_s: Start of the target's motion, s; CHIRP: start of the first sweep.
-        move_end_s: End of the target's motion, s; CHIRP: end of the first sweep.
+        move_start_s: Start of the target's motion, s. CHIRP: start of the first sweep.
+        move_end_s: End of the target's motion, s. CHIRP: end of the first sweep.
         a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND:
             target before the motion, rad or m. WALL: a point of the wall, m. Live hand: target
             or force.
-        b: HAND, TASK_HAND: target after the motion. WALL: the normal that points away from the
-            wall, length 1. CHIRP: frequencies at the start and the end of a sweep, Hz. Live
-            hand: Position of the target one second later.
-        K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
+        b: HAND, TASK_HAND: target after the motion. WALL: unit normal, pointing away from the
+            wall. CHIRP: frequencies at the start and the end of a sweep, Hz. Live hand:
+            position of the target one second later.
+        K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first element).
         B: Damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
-            number).
-        sampled: True if the torque is evaluated once per tick (period of the control loop), and
-            constant until the next tick.
+            element).
+        sampled: True if the torque is evaluated once per tick and held constant until the next
+            tick.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
-            MULTISINE: Rows of frequency, Hz, and phase at the start, turns; further columns are
-            not used.
+            MULTISINE: rows of frequency, Hz, and initial phase, turns; any further columns are
+            ignored.
         limit: Live hand: the largest norm of its force, N, or torque, N m.
-        grip: Live hand: factor of its force, 0 to 1.
-        model: User's kind: the object with its parameters and its function `act`, see
-            `plugged`.
+        grip: Live hand: factor applied to its force, 0 to 1.
+        model: User-defined kind: the object that holds the parameters and the function `act`.
+            See `plugged`.
     """
 
     kind: TorqueKind
@@ -130,17 +127,16 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type that stores the parameters of an operator or an environment.
+    """Returns the NumPy dtype of the parameters of an operator or environment.
 
-    There is one row per operator or environment. It contains the fields of `TorqueSource`, and
-    in addition:
+    A row contains the fields of `TorqueSource` and the following:
 
     - `table_first` and `table_count` select the rows of the common table that belong to this
       operator or environment: recorded torques, sines, or parameters of a user's function.
-    - The other additional fields serve a function that a user wrote. `call` is its address. The
-      function reads its input from `t_s` (time since the start of the session, s),
-      `coordinates` (their number), `at` (position of the arm, rad or m) and `speed` (derivative
-      of `at`), and writes the force or torque into `effort`, N or N m.
+    - `call` is the address of a function written by a user. The function reads its input from
+      `t_s` (time since the start of the session, s), `coordinates` (their number), `at`
+      (position of the arm, rad or m) and `speed` (derivative of `at`), and writes the force or
+      torque into `effort`, N or N m.
 
     Args:
         width: Largest length of the vectors of all operators and environments.
@@ -159,9 +155,9 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
 TorqueSourceRows = NDArray[np.void]
 TorqueTable = Array
 SourceTorque = tuple[float, float, float]
-"""Torque ON each joint, N m, and the largest force of a wall that contributes to it, N."""
+"""Torque ON each joint, N m, and the largest wall force that contributes to it, N."""
 NO_TORQUE: SourceTorque = (0.0, 0.0, 0.0)
-"""The torque on an arm without operators and environments."""
+"""Torque on an arm with no operators or environments."""
 
 _PULSE = int(TorqueKind.PULSE)
 _HAND = int(TorqueKind.HAND)
@@ -177,21 +173,19 @@ _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 def torque_source_rows(
     actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Converts operators and environments to two NumPy arrays, which compiled code can read.
+    """Converts operators and environments to two NumPy arrays that compiled code can read.
 
-    An operator is a model of a person who moves an arm, and an environment a wall or a damper.
     Compiled code cannot read Python objects. Lists of different lengths, such as recorded
-    torques, are joined into one table.
+    torques, are concatenated into one table.
 
     Args:
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm.
         joints: Number of joints of the arm.
         axes: Number of Cartesian axes: 2 for the planar arm, 3 for a chain of joints.
 
     Returns:
-        An array with one row per operator or environment, and a table. The table contains
-        recorded torques and other lists of numbers. A row states which rows of the table belong
-        to it.
+        An array with one row per operator or environment, and the common table of recorded
+        torques and other lists. Each row states which rows of the table belong to it.
     """
     width = 1 + joints
     rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
@@ -219,7 +213,7 @@ def torque_source_rows(
         if content is None:
             continue
 
-        # All tables have the same number of columns, filled up with zeros.
+        # All tables have the same number of columns, padded with zeros.
         columns = np.shape(content)[1]
         table = np.zeros((len(content), width))
         table[:, :columns] = content
@@ -232,7 +226,7 @@ def torque_source_rows(
 
 @leaf
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
-    """Returns the progress of a minimum-jerk motion, as smooth as the motion of a human arm.
+    """Returns the progress of a minimum-jerk motion, which resembles human reaching.
 
         10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
 
@@ -263,14 +257,14 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
 def _spring_along(
     actor: Row, i: int, progress: float, rate: float, at: float, speed: float
 ) -> float:
-    """Returns the force of the spring and damper by which an operator pulls the arm.
+    """Returns the force of the spring and damper with which an operator pulls the arm.
 
-    It is the force or torque along one coordinate, N or N m:
+    The result is the force or torque along one coordinate, N or N m:
 
         K (target - at) + B (target_speed - speed),    target = a + progress (b - a)
 
     Args:
-        actor: Data of the operator, with the stiffness K, the damping B and the path of the
+        actor: Row of the operator, with the stiffness K, the damping B and the path of the
             target from a to b.
         i: Index of the coordinate.
         progress: Progress of the target from a to b, 0 to 1.
@@ -289,36 +283,36 @@ def _spring_along(
 
 @leaf
 def _target_progress(actor: Row, t_s: float) -> Pair:
-    """Returns how far the target of an operator is on its path from `a` to `b`, and its rate.
+    """Returns the progress of an operator's target along its path from `a` to `b`.
 
-    The spring of the operator pulls the arm to this target. A scripted operator moves the
-    target along a minimum-jerk path. If a person or program moves the arm (live hand), the
-    target is at `a`, and moves by b - a per second.
+    The operator's spring pulls the arm towards this target. A scripted operator moves the
+    target along a minimum-jerk path. The target of a live hand (a person or program) is at `a`,
+    and moves by b - a per second.
 
     Args:
-        actor: Data of the operator, see `torque_source_dtype`.
+        actor: Row of the operator. See `torque_source_dtype`.
         t_s: Time since the start of the session, s.
 
     Returns:
-        The progress, 0 to 1, for the position a + progress (b - a) of the target, and its
-        derivative, for the velocity rate (b - a).
+        The progress, 0 to 1, and its rate, 1/s. The target is at a + progress (b - a), and its
+        velocity is rate (b - a).
     """
     is_live_hand = actor.kind >= _LIVE_TIP  # the live kinds have the largest numbers
     if is_live_hand:
-        # `a` is the present target, and `b` the target one second later.
+        # `a` is the current target, and `b` the target one second later.
         return 0.0, 1.0
     return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
 
 
 @leaf
 def _live_share(actor: Row, square: float) -> float:
-    """Returns the factor that reduces the force of a person who moves the arm (live hand).
+    """Returns the factor that reduces the force of a live hand.
 
-    The norm of the force is first limited, because a human hand has limited strength. Then the
-    force is multiplied by the grip: 1 for a firm grip, 0 after the hand has let go.
+    The norm of the force is limited first, because a human hand has limited strength. The force
+    is then multiplied by the grip, from 1 (firm) to 0 (released).
 
     Args:
-        actor: Data of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
+        actor: Row of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
         square: Square of the norm of the force, N^2 or N^2 m^2.
     """
     factor: float = actor.grip
@@ -329,14 +323,14 @@ def _live_share(actor: Row, square: float) -> float:
 
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
-    """Returns the force of an operator, who pulls the arm to a target, N or N m.
+    """Returns the force of an operator who pulls the arm towards a target, N or N m.
 
     A spring and a damper act between the arm and the target along two coordinates. The force of
-    a person who moves the arm during the run (live hand) is limited, and smaller while the grip
-    is not firm. The kind LIVE_FORCE has no spring: its force is given.
+    a live hand is limited, and reduced while the grip is not firm. For the kind LIVE_FORCE, the
+    force is set directly, without a spring.
 
     Args:
-        actor: Data of the operator, see `torque_source_dtype`.
+        actor: Row of the operator. See `torque_source_dtype`.
         t_s: Time since the start of the session, s.
         at: Position of the arm along the coordinates, rad or m.
         speed: Derivative of the position, rad/s or m/s.
@@ -363,16 +357,16 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
     """Finds the two recorded torques between which to interpolate at time t.
 
-    The recording is a table with a row per time, in which a bisection finds the neighbours.
+    The recording is a table with one row per time, which is searched by bisection.
 
     Args:
-        actor: Data of the operator, with the position of its rows in the common table.
+        actor: Row of the operator, with the position of its data in the common table.
         t_s: Time since the start of the session, s.
         table: Tables of all operators and environments. Column 0 is the time of a row, s.
 
     Returns:
-        The indices of the rows before and after the time, and the position of the time between
-        these rows, from 0 to 1. The indices are -1 if the time is outside the recording.
+        The indices of the rows before and after t, and the relative position of t between these
+        rows, from 0 to 1. The indices are -1 if t is outside the recording.
     """
     first = actor.table_first
     count = actor.table_count
@@ -392,12 +386,12 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
 
 @leaf
 def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Returns the torque of an operator whose torques were recorded, by linear interpolation.
+    """Returns the recorded torque of an operator at time t, by linear interpolation.
 
     The torque is zero before and after the recording.
 
     Args:
-        actor: Data of the operator.
+        actor: Row of the operator.
         t_s: Time since the start of the session, s.
         table: Tables of all operators and environments, for example of recorded torques.
     """
@@ -415,7 +409,7 @@ def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
 def _sine_of_turns(turns: float) -> float:
     """Returns sin(2 pi turns) for any number of turns.
 
-    The whole turns are removed first, because the sine of a large angle would lose digits.
+    Complete turns are removed first, because the sine of a large angle would lose precision.
     """
     fraction = turns - math.floor(turns)
     s, _ = sincos(2.0 * math.pi * fraction)
@@ -424,16 +418,16 @@ def _sine_of_turns(turns: float) -> float:
 
 @leaf
 def _chirp_size(actor: Row, t_s: float) -> float:
-    """Returns the present value of a chirp, a sine whose frequency rises or falls with time.
+    """Returns the current value of a chirp, a sine whose frequency changes with time.
 
     Such a torque excites the arm at all frequencies of a range, one after another, in repeated
     sweeps. With the frequencies f0 and f1 at the start and the end of a sweep, the duration
-    `span` of a sweep, and the time x since the present sweep began, the value is
+    `span` of a sweep, and the time x since the current sweep began, the value is
 
         sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
 
     Args:
-        actor: Data of the operator, with the frequencies in `b`, Hz.
+        actor: Row of the operator, with the frequencies in `b`, Hz.
         t_s: Time since the start of the session, s.
     """
     first_hz = actor.b[0]
@@ -450,12 +444,12 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 
 @leaf
 def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the present value of a multisine, a sum of sines that each have the amplitude 1.
+    """Returns the current value of a multisine, a sum of sines of amplitude 1.
 
     Such a torque excites the arm at several frequencies at once.
 
     Args:
-        actor: Data of the operator.
+        actor: Row of the operator.
         t_s: Time since the start of the session, s.
         table: Tables of all actors, here with rows of frequency, Hz, and phase, turns.
     """
@@ -472,17 +466,17 @@ def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
 @leaf
 def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the present value of a scripted torque, as a multiple of its amplitude `a`.
+    """Returns the current value of a scripted torque, as a multiple of its amplitude `a`.
 
     The torque is a pulse, a chirp or a multisine. A pulse is
 
         sin^2(pi (t - start) / (end - start))
 
-    which is smooth at both ends as in Fig. 3 of the paper. The paper does not give the
+    which is smooth at both ends, as in Fig. 3 of the paper. The paper does not state the
     parameters of its pulses.
 
     Args:
-        actor: Data of the operator.
+        actor: Row of the operator.
         t_s: Time since the start of the session, s.
         table: Tables of all operators and environments, for example of recorded torques.
     """
@@ -503,7 +497,7 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
     The wall is a spring and a damper. The force acts along the wall's normal and never pulls.
 
     Args:
-        actor: Data of the wall: a point of it in `a`, m, and its outward normal in `b`.
+        actor: Row of the wall: a point of the wall in `a`, m, and the outward normal in `b`.
         at: Position of the end effector, m.
         speed: Velocity of the end effector, m/s.
     """
@@ -526,8 +520,7 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 def _is_at_end_effector(actor: Row) -> bool:
     """Returns True if the force of an actor acts on the end effector, False if on the joints.
 
-    An actor is an operator or an environment. A force at the end effector has to be converted
-    to joint torques by the transposed Jacobian.
+    A force at the end effector must be mapped to joint torques by the transposed Jacobian.
     """
     kind: int = actor.kind
     return kind in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
@@ -535,16 +528,15 @@ def _is_at_end_effector(actor: Row) -> bool:
 
 @leaf
 def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
-    """Calls the compiled function of an operator or environment that a user wrote.
+    """Calls a user's compiled function of an operator or environment.
 
-    An operator is a model of a person who moves an arm, and an environment a wall or a damper.
-    The program and the function exchange values through the fields of the row `actor`. The
-    program has written the position (`at`) and the velocity (`speed`) before the call, and has
-    set `effort` to zero. The function writes the resulting torque or force into `effort`.
+    Values are exchanged through the fields of the row `actor`. Before the call, the position
+    (`at`) and the velocity (`speed`) have been written, and `effort` has been set to zero. The
+    function writes the resulting torque or force into `effort`.
 
     Args:
-        actor: Data of the operator or environment. `call` is the address of the function.
-        t_s: Time since the epoch (the common start of the session), s.
+        actor: Row of the operator or environment. `call` is the address of the function.
+        t_s: Time since the start of the session, s.
         table: Tables of all actors. The rows `table_first` to `table_first + table_count` hold
             the parameters of the user's model.
     """
@@ -559,12 +551,12 @@ def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
 
 @leaf
 def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
-    """Returns the torque or force of an operator or environment that a user programmed.
+    """Returns the torque or force of a user-defined operator or environment.
 
     The result acts on the two joints of the planar arm, N m, or along two axes, N.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         at: Position along the joints or axes, rad or m.
         speed: Derivative of the position, rad/s or m/s.
@@ -583,11 +575,11 @@ def _end_effector_torque(
 ) -> SourceTorque:
     """Returns the joint torque of an operator or environment that acts at the end effector.
 
-    Its force F has the effect of the joint torque J' F, where J is the Jacobian of the end
-    effector. The third number is the norm of F for a wall, N, and 0 otherwise.
+    A force F is equivalent to the joint torque J' F, where J is the Jacobian of the end
+    effector. The third value is the norm of F for a wall, N, and 0 otherwise.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
@@ -618,8 +610,7 @@ def source_torque(
 ) -> SourceTorque:
     """Computes the joint torque that one operator or environment exerts on the planar arm.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    A force at the end effector is converted to joint torques by the transposed Jacobian.
+    A force at the end effector is mapped to joint torques by the transposed Jacobian.
 
     Args:
         t_s: Time since the start of the session, s.
@@ -627,11 +618,11 @@ def source_torque(
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
         actor: Parameters of the operator or environment.
-        table: Recorded torques and other numbers of all operators and environments.
+        table: Recorded torques and other data of all operators and environments.
 
     Returns:
-        The torques on the two joints, N m, and the force of the wall, N. The force is 0 if the
-        environment is not a wall.
+        The torques on the two joints, N m, and the force exerted by the wall, N (0 if the
+        environment is not a wall).
     """
     is_active = actor.start_s <= t_s < actor.end_s
     if not is_active:
@@ -671,21 +662,19 @@ def add_source_torque(
 ) -> SourceTorque:
     """Adds the joint torque of one operator or environment to a running sum.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-
     Args:
-        total: Torque on the joints so far, N m, and the largest force of a wall so far, N.
+        total: Sum of the joint torques so far, N m, and the largest wall force so far, N.
         t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
         actor: Parameters of the operator or environment.
-        table: Recorded torques and other numbers of all operators and environments.
-        sampled: 1 to add the torque only if it is constant during a control period (sampled). 0
-            to add it only if it acts continuously.
+        table: Recorded torques and other data of all operators and environments.
+        sampled: 1 to add the torque only if the actor is sampled (held constant during a
+            control period), 0 to add it only if the actor acts continuously.
 
     Returns:
-        The new total. It equals `total` if `sampled` excludes the actor.
+        The new total, equal to `total` if `sampled` excludes the actor.
     """
     if actor.sampled != sampled:
         return total
@@ -705,22 +694,20 @@ def torque_on_arm(
 ) -> SourceTorque:
     """Computes the joint torque that all operators and environments exert on the planar arm.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    Some are sampled: their torque is evaluated once per period of the control loop and constant
-    until the next period. One call computes the torque of either the sampled ones or all
-    others.
+    Some of them are sampled: their torque is evaluated once per control period and held
+    constant. All others act continuously. One call covers one of the two groups.
 
     Args:
         t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
-        actors: Operators and environments, one row for each.
-        table: Recorded torques and other numbers of all actors.
+        actors: Operators and environments, one row each.
+        table: Recorded torques and other data of all actors.
         sampled: 1 for the torque of the sampled actors, 0 for all others.
 
     Returns:
-        The torques on the two joints, N m, and the largest force of a wall, N.
+        The torques on the two joints, N m, and the largest wall force, N.
     """
     total = NO_TORQUE
     for n in range(actors.shape[0]):
@@ -743,11 +730,11 @@ def _force_in_space(
 ) -> Three:
     """Returns the force of an operator or environment on the end effector of a chain, N.
 
-    The force comes from a user's function, from an operator who pulls the end effector by a
-    spring, or from a wall that pushes the end effector.
+    The force is exerted by a user's function, by an operator who pulls the end effector with a
+    spring, or by a wall that pushes it.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         at: Position of the end effector, m.
         speed: Velocity of the end effector, m/s.
@@ -805,20 +792,20 @@ def _add_joint_torque(
 ) -> None:
     """Adds the torque of an operator or environment that acts directly on joints of a chain.
 
-    Examples are a recorded torque per joint, and a damper in each joint. Forces at the end
-    effector are converted to joint torques elsewhere, by `put_torque_on_chain`.
+    Examples are a recorded torque per joint and a damper at each joint. Forces at the end
+    effector are mapped to joint torques by `put_torque_on_chain`.
 
     Args:
-        actor: Data of the operator or environment.
+        actor: Row of the operator or environment.
         t_s: Time since the start of the session, s.
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         joints: Number n of joints.
         table: Tables of all operators and environments, for example of recorded torques.
-        torque: The torque is added to it, shape (n,), N m.
+        torque: The torque is added to this array, shape (n,), N m.
     """
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
-        # An operator, who pulls each joint to a target by a spring.
+        # An operator who pulls each joint towards a target with a spring.
         progress, rate = _target_progress(actor, t_s)
         factor = 1.0
         square = 0.0
@@ -866,8 +853,8 @@ def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]
     Args:
         qd: Joint velocities, shape (n,), rad/s or m/s.
         tip: Position of the end effector in the last link's frame, m.
-        chain: Data of the joints, one row per joint. `place_joints` must have been called
-            before. The Jacobian of the end effector is written into it.
+        chain: Joint data, one row per joint. `place_joints` must have been called before. The
+            Jacobian of the end effector is written into it.
     """
     position = place_end_effector(chain, tip)
     velocity = (0.0, 0.0, 0.0)
@@ -891,25 +878,23 @@ def put_torque_on_chain(
 ) -> float:
     """Computes the joint torque that operators and environments exert on a chain of joints.
 
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
-    Some are sampled: their torque is evaluated once per period of the control loop and constant
-    until the next period. One call computes the torque of either the sampled ones or all
-    others.
+    Some of them are sampled: their torque is evaluated once per control period and held
+    constant. All others act continuously. One call covers one of the two groups.
 
     Args:
         t_s: Time since the start of the session, s.
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         tip: Position of the end effector in the last link's frame, m.
-        chain: Data of the n joints, one row per joint. `place_joints` must have been called for
-            the same positions.
-        actors: Operators and environments, one row for each.
-        table: Recorded torques and other numbers of all actors.
+        chain: Joint data, one row per joint. `place_joints` must have been called for the same
+            positions.
+        actors: Operators and environments, one row each.
+        table: Recorded torques and other data of all actors.
         sampled: 1 for the torque of the sampled actors, 0 for all others.
         torque: Receives the torque on the arm, shape (n,), N m.
 
     Returns:
-        The largest force of a wall, N. 0 if no wall is touched.
+        The largest wall force, N (0 if no wall is touched).
     """
     n = chain.shape[0]
     for i in range(n):

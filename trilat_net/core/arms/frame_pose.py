@@ -1,9 +1,9 @@
-"""Computes products of the poses of frames, and expresses inertias in other frames.
+"""Combines the poses of coordinate frames, and expresses inertias in other frames.
 
-The functions are plain Python, because the files of arms are read before any code is compiled.
+The functions are plain Python, because arm files are read before any code is compiled.
 
 Invariant:
-    - Each sum has a fixed order, so that results are the same on every machine.
+    - Sums are evaluated in a fixed order, which makes the results identical on every machine.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from .chain import Matrix, Three, multiply_matrices, multiply_vector
 from .elementary import sincos
 
 _plain_sincos = getattr(sincos, "py_func", sincos)
-"""The function `sincos` as plain Python. Compiling it takes longer than reading a file."""
+"""Uncompiled version of `sincos`, because compiling takes longer than reading an arm file."""
 
 
 class FramePose(NamedTuple):
@@ -31,8 +31,8 @@ class FramePose(NamedTuple):
         """Returns the pose with the rotation R_z(yaw) R_y(pitch) R_x(roll).
 
         Args:
-            rpy_rad: The angles roll, pitch and yaw.
-            origin_m: Origin of the frame.
+            rpy_rad: Roll, pitch and yaw angles, rad.
+            origin_m: Origin of the frame, m.
         """
         # s and c are sines and cosines.
         (sr, cr), (sp, cp), (sy, cy) = map(_plain_sincos, rpy_rad)
@@ -44,10 +44,10 @@ class FramePose(NamedTuple):
         return cls(rotation, origin_m)
 
     def __matmul__(self, inner: "FramePose") -> "FramePose":
-        """Returns the product of two poses, which places one frame inside another.
+        """Returns the composition of two poses.
 
-        The pose `inner` is relative to the frame of this pose. The result is the pose of the
-        inner frame, relative to the frame to which this pose is relative.
+        `inner` is expressed in the frame of this pose. The result is the pose of the inner
+        frame, expressed in the outer frame of this pose.
         """
         x, y, z = self.turn(inner.origin_m)
         ox, oy, oz = self.origin_m
@@ -55,23 +55,23 @@ class FramePose(NamedTuple):
         return FramePose(rotation, (ox + x, oy + y, oz + z))
 
     def turn(self, vector: Three) -> Three:
-        """Rotates a vector from the axes of this frame to the axes of the outer frame.
+        """Transforms a vector from the axes of this frame to the axes of the outer frame.
 
         Args:
-            vector: The vector in the axes of this frame.
+            vector: The vector, expressed in this frame.
         """
         return multiply_vector(self.rotation, vector)
 
     def place_body(self, mass: float, tensor: Matrix) -> tuple[float, ...]:
-        """Returns the inertial parameters of a body in the outer frame of this pose.
+        """Returns the inertial parameters of a body, expressed in the outer frame of this pose.
 
         The tensor I about the centre of mass is rotated, R I R^T, and moved to the origin of
-        the other frame by the parallel axis theorem.
+        the outer frame with the parallel axis theorem.
 
         Args:
             mass: Mass, in kg.
-            tensor: Inertia about the centre of mass, in kg m^2. The origin of this pose is the
-                centre of mass, and its axes are those of the tensor.
+            tensor: Inertia about the centre of mass, in kg m^2, in the axes of this pose. The
+                origin of this pose is the centre of mass.
 
         Returns:
             The ten parameters m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.

@@ -1,4 +1,4 @@
-"""Converts and combines rotation vectors (axis times angle, rad), bit for bit alike anywhere.
+"""Converts and combines rotation vectors (axis times angle, rad), identically on all machines.
 
 The angular velocity of a changing rotation vector u is J(u) u', where J is the left Jacobian of
 the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for state estimation
@@ -6,9 +6,9 @@ in robotics", arXiv 1812.01537, Eq. 145, 146). The arc tangent is from S. Moshie
 library.
 
 Invariant:
-    - A rotation vector is at most half a turn long.
-    - `rotation_matrix` and `rotation_vector` are inverse to each other.
-    - Only basic arithmetic and square roots are used, which all machines round alike.
+    - The length of a rotation vector is at most pi.
+    - `rotation_matrix` and `rotation_vector` are inverses of each other.
+    - Only basic arithmetic and square roots are used, which all machines round identically.
 """
 
 import math
@@ -19,20 +19,20 @@ from .chain import Matrix, Three, add_vectors, cross_product, dot_product, scale
 from .elementary import sincos
 
 _SMALL = 1e-8
-"""Below this angle, rad, the sine equals the angle to the last bit."""
+"""Angle, rad, below which the sine equals the angle to the last bit."""
 _SHORT = 0.02
-"""Below this angle, rad, the first terms of a series are exact to the last bit, in contrast to
-closed forms.
+"""Angle, rad, below which the first terms of a series are exact to the last bit, whereas closed
+forms are not.
 """
 
 
 @leaf
 def arctan(x: float) -> float:
-    """Returns the arc tangent of a number from 0 to 1, rad, with equal bits on every machine.
+    """Returns the arc tangent of a number from 0 to 1, rad, bit-identical on every machine.
 
-    The standard library is not used, because its last bit differs between platforms. The method
-    is from Cephes (`atan`): a rational function P / Q of x^2, after a transformation of numbers
-    above 0.66.
+    The standard library is not used because its last bit differs between platforms. The method
+    is from Cephes (`atan`): a rational function P / Q of x^2, with a range reduction for
+    arguments above 0.66.
     """
     # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
     is_large = x > 0.66
@@ -54,10 +54,10 @@ def arctan(x: float) -> float:
 
 @leaf
 def rotation_matrix(vector: Three) -> Matrix:
-    """Returns the rotation matrix of a rotation vector, three rows.
+    """Returns the rotation matrix of a rotation vector, as three rows.
 
-    A rotation vector has the direction of the axis, and its length is the angle in rad. The
-    formula is due to Rodrigues, with limits for small angles.
+    The direction of a rotation vector is the rotation axis, and its length is the angle in rad.
+    Rodrigues' formula is used, with series limits for small angles.
     """
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
@@ -86,17 +86,17 @@ def rotation_matrix(vector: Three) -> Matrix:
 def _choose_component(
     trace: float, xx: float, yy: float, zz: float, components: tuple[float, float, float, float]
 ) -> float:
-    """Returns one of four values, depending on which component of a quaternion is the largest.
+    """Returns one of four values, depending on which quaternion component is largest.
 
-    The components themselves are not known yet. The diagonal xx, yy, zz of the rotation matrix
-    and its trace tell which of them has the largest magnitude.
+    The components themselves are not yet known. The component with the largest magnitude is
+    determined from the trace and the diagonal of the rotation matrix.
 
     Args:
         trace: Trace of the rotation matrix.
-        xx: First number of its diagonal.
-        yy: Second number of its diagonal.
-        zz: Third number of its diagonal.
-        components: Values if w, x, y or z is the largest component.
+        xx: First diagonal element.
+        yy: Second diagonal element.
+        zz: Third diagonal element.
+        components: Values to return if w, x, y or z is the largest component.
     """
     by_w, by_x, by_y, by_z = components
     by_others = choose(yy >= zz, by_y, by_z)
@@ -108,7 +108,7 @@ def _choose_component(
 def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     """Converts a rotation matrix to a quaternion (w, v), with the scalar part w >= 0.
 
-    The method starts from the largest component (Shepperd, 1978), and so never divides by a
+    The method starts from the largest component (Shepperd, 1978), which avoids division by a
     small number.
     """
     xx, xy, xz = R[0]
@@ -136,9 +136,7 @@ def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
 
 @leaf
 def rotation_vector(R: Array | Matrix) -> Three:
-    """Returns the rotation vector of a rotation matrix, rad.
-
-    A rotation vector has the direction of the axis, and its length is the angle.
+    """Returns the rotation vector (axis times angle, rad) of a rotation matrix.
 
     Args:
         R: The rotation matrix, three rows.
@@ -160,19 +158,17 @@ def rotation_vector(R: Array | Matrix) -> Three:
 
 @leaf
 def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
-    """Returns the rotation that turns the orientation `other` into the orientation R.
+    """Returns the rotation that takes the orientation `other` to the orientation R.
 
-    The result is a rotation vector in the axes of the base frame: its direction is the axis,
-    its length the angle in rad. It is the orientation error of an arm that should reach
-    `other`.
+    For an arm that should reach `other`, this is the orientation error.
 
     Args:
         R: Rotation matrix of the first orientation, three rows.
         other: Rotation matrix of the second orientation, three rows.
 
     Returns:
-        The rotation vector of R other', whose direction is the axis and whose length is the
-        angle in rad.
+        The rotation vector of R other' in base axes. Its direction is the rotation axis, and
+        its length is the angle in rad.
     """
     row_1 = other[0]
     row_2 = other[1]
@@ -187,8 +183,8 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
     """Returns the scalar products of the vector `row` with the three vectors a, b and c.
 
-    These are one row of the product P Q' of two matrices, where `row` is a row of P, and a, b
-    and c are the rows of Q.
+    The result is one row of the matrix product P Q', where `row` is a row of P, and a, b and c
+    are the rows of Q.
     """
     x = row[0]
     y = row[1]
@@ -201,15 +197,14 @@ def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
 
 @leaf
 def compose_rotations(turn: Three, vector: Three) -> Three:
-    """Returns the rotation `vector`, followed by the rotation `turn` about base axes.
+    """Returns the rotation `vector` followed by the rotation `turn` about base axes.
 
-    All three are rotation vectors: the direction is the axis, the length the angle in rad. With
-    the rotation matrices T of `turn` and R of `vector`, the result is the rotation vector of
-    T R.
+    Arguments and result are rotation vectors (axis times angle, rad). If T and R are the
+    rotation matrices of `turn` and `vector`, the result is the rotation vector of T R.
 
     Args:
-        turn: Rotation vector of the second rotation.
-        vector: Rotation vector of the first rotation.
+        turn: Rotation vector of the second rotation, rad.
+        vector: Rotation vector of the first rotation, rad.
     """
     second_matrix = rotation_matrix(turn)
     inverse_vector = scale_vector(-1.0, vector)
@@ -220,13 +215,13 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
 
 @leaf
 def rotate_by_vector(turn: Three, vector: Three) -> Three:
-    """Returns a 3D vector after a rotation, which is given by its rotation vector.
+    """Rotates a 3D vector by the rotation given as a rotation vector.
 
-    A rotation vector has the direction of the axis, and its length is the angle in rad. For
-    example, the rotation vector (0, 0, pi/2) turns the x axis into the y axis.
+    For example, the rotation vector (0, 0, pi/2) turns the x axis into the y axis.
 
     Args:
-        turn: Rotation vector: its direction is the axis, its length the angle in rad.
+        turn: Rotation vector. Its direction is the rotation axis, and its length is the angle
+            in rad.
         vector: The vector to rotate.
     """
     x, y, z = rotation_matrix(turn)
@@ -235,7 +230,7 @@ def rotate_by_vector(turn: Three, vector: Three) -> Three:
 
 @leaf
 def length(vector: Three) -> float:
-    """Returns the Euclidean length of a 3D vector, in the unit of its numbers."""
+    """Returns the Euclidean length of a 3D vector, in the same unit as its components."""
     return math.sqrt(dot_product(vector, vector))
 
 
@@ -243,15 +238,15 @@ def length(vector: Three) -> float:
 def angular_velocity(turn: Three, rate: Three) -> Three:
     """Returns the angular velocity of a body with a changing rotation vector, rad/s.
 
-    The angular velocity differs from the derivative of the rotation vector as soon as the axis
-    changes too. With the rotation vector u, its length a (the angle) and its derivative u', the
+    The angular velocity equals the derivative of the rotation vector only while the axis is
+    fixed. In general, for a rotation vector u with length a (the angle) and derivative u', the
     angular velocity is the left Jacobian times u':
 
         w = u' + (1 - cos a) / a^2  u x u' + (a - sin a) / a^3  u x (u x u')
 
     Args:
         turn: The rotation vector u, rad.
-        rate: The derivative of the rotation vector, rad/s.
+        rate: The derivative u' of the rotation vector, rad/s.
     """
     angle = length(turn)
     a2 = angle * angle
@@ -274,15 +269,15 @@ def angular_velocity(turn: Three, rate: Three) -> Three:
 
 @leaf
 def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
-    """Returns the derivative of a rotation vector at an angular velocity, rad/s.
+    """Returns the derivative of a rotation vector for a given angular velocity, rad/s.
 
-    With the rotation vector u, its length a (the angle), and the angular velocity w about base
-    axes, the derivative is w times the inverse of the left Jacobian:
+    This is the inverse of `angular_velocity`. For a rotation vector u with length a (the angle)
+    and the angular velocity w about base axes, the derivative is the inverse of the left
+    Jacobian times w:
 
         u' = w - 1/2 u x w + c u x (u x w),    c = (1 - (a / 2) cos(a / 2) / sin(a / 2)) / a^2
 
-    For small angles, c is the series 1/12 + a^2 / 720 + a^4 / 30240. The function is the
-    inverse of `angular_velocity`.
+    For small angles, c is evaluated as the series 1/12 + a^2 / 720 + a^4 / 30240.
 
     Args:
         turn: The rotation vector u, rad.

@@ -1,25 +1,26 @@
-"""Lets the end effectors of different arms follow each other (control in task space).
+"""Task-space control: the end effectors of different arms follow each other.
 
-Without task space, arms compare their joint angles, which requires equal arms.
+In joint space, arms compare their joint angles instead, which requires identical kinematics.
 
 Symbols: q and qd are the positions and velocities of the joints, J is the Jacobian of the
-coordinates that are followed, and Jd its derivative. x is the pose of the end effector, and e
-the difference from the desired pose. The error decays with the rate Lambda, in 1/s. The
-transpose of a matrix is written J', and the derivative of a vector dx/dt.
+followed coordinates, and Jd its derivative. x is the pose of the end effector, and e its
+deviation from the desired pose. The error decays at the rate Lambda, in 1/s. J' denotes the
+transpose of a matrix, and dx/dt the derivative of a vector.
 
-The control law needs a reference velocity v of the joints and its derivative a:
+The control law needs a joint reference velocity v and its derivative a:
 
     v = psi + J' y                J J' y     = -Lambda e - J psi
     a = dpsi/dt + d(J' y)/dt      J J' dy/dt = -Lambda de/dt - Jd psi - J dpsi/dt
                                                - (Jd J' + J Jd') y
 
-Here psi = -k (q - q_posture) pulls the joints to a preferred posture with the rate k, in 1/s.
-Only its part that does not move the end effector has an effect. The second equation defines y.
-For the filtered error r = qd - v it follows that J r = dx/dt + Lambda e.
+Here psi = -k (q - q_posture) pulls the joints towards a preferred posture at the rate k, in
+1/s. Only the component of psi that does not move the end effector has an effect. The second
+equation of the first line defines y. For the filtered error r = qd - v, it follows that J r =
+dx/dt + Lambda e.
 
-Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1) is above the
-square of `singular_value`. This number is a lower bound of the square of the least singular
-value of J.
+Near singular poses, damping is added to J J'. The damping is zero while 1 / trace((J J')^-1), a
+lower bound of the square of the smallest singular value of J, exceeds the square of
+`singular_value`.
 
 Source: Y.-C. Liu and N. Chopra, "Controlled synchronization of heterogeneous robotic
 manipulators in the task space", IEEE Trans. Robotics 28 (2012); damping after Y. Nakamura and
@@ -27,8 +28,8 @@ H. Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dynam
 Measurement, and Control 108 (1986).
 
 Invariant:
-    - All vectors of the task refer to a frame that all arms share. They have 3 numbers for a
-      position, m, or 6 for a pose with an orientation (`rotation_vector`).
+    - All task-space vectors refer to a frame shared by all arms. They have 3 components for a
+      position, m, or 6 for a pose that includes an orientation (see `rotation_vector`).
     - A coordinate that an arm does not follow has no effect on this arm.
 """
 
@@ -47,18 +48,18 @@ from .chain import (
 from .rotation import compose_rotations, relative_rotation, rotation_matrix
 
 POSITION = 3
-"""Number of a task's coordinates without an orientation."""
+"""Number of task-space coordinates if only positions are followed."""
 POSE = 6
-"""Number of a task's coordinates with an orientation."""
+"""Number of task-space coordinates if positions and orientations are followed."""
 TINY = 1e-12
-"""For a pivot of J J' below this value, the end effector cannot move along the axis at all."""
+"""Pivot of J J' below which the end effector cannot move along the axis at all."""
 
 
 @leaf
 def has_orientation(s: Row) -> bool:
     """Returns True if the arms follow each other in position and orientation (6 coordinates).
 
-    The result is False if they follow only positions of the end effector, or joint angles.
+    Returns False if they follow only end effector positions, or joint angles.
     """
     is_pose: bool = s.task != 0 and s.shared == POSE
     return is_pose
@@ -66,30 +67,27 @@ def has_orientation(s: Row) -> bool:
 
 @leaf
 def count_linear_coordinates(s: Row) -> int:
-    """Returns how many of the shared coordinates can be subtracted as plain numbers.
+    """Returns the number of shared coordinates whose difference is a plain subtraction.
 
-    The arms of a session share positions (m) or joint angles (rad), which come first. The last
-    three coordinates of a pose are an orientation, and the difference of two orientations is a
-    rotation instead.
+    These are the positions (m) or joint angles (rad), which come first. In a pose, the last
+    three coordinates are an orientation, and the difference of two orientations is a rotation.
     """
     return POSITION if has_orientation(s) else s.q_des.shape[0]
 
 
 @leaf
 def update_pose(s: Row, chain: RowArray) -> None:
-    """Computes the motion of the end effector from that of the joints.
+    """Computes the pose and velocity of the end effector from the motion of the joints.
 
-    The results are the pose x, its velocity xd, the Jacobian J and the derivative of J. The
-    coordinates are a position, or a position and a rotation vector. They refer to the frame
-    that all arms share.
+    The results are the pose x, its velocity xd, the Jacobian J and the derivative of J. A pose
+    is a position, or a position and a rotation vector, in the frame shared by all arms.
 
     Args:
-        s: State of the site (the process that runs the arm), with the joint positions q and
-            velocities qd; written. `tip` is the end effector's position in the frame of the
-            last link, m, `tip_back` the inverse of its orientation in this frame, and `scale`
-            the size of the shared coordinates in relation to this arm.
-        chain: Data of the joints, one row per joint. `place_joints` must have been called
-            before.
+        s: State of the site, with the joint positions q and velocities qd; modified. `tip` is
+            the end effector's position in the frame of the last link, m, `tip_back` the inverse
+            of its orientation in that frame, and `scale` the ratio of the shared coordinates to
+            the coordinates of this arm.
+        chain: Joint data, one row per joint. `place_joints` must have been called before.
     """
     # This also writes the frames of the links and the columns of J in base axes.
     position = place_end_effector(chain, s.tip)
@@ -123,16 +121,14 @@ def update_pose(s: Row, chain: RowArray) -> None:
 
 @leaf
 def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
-    """Computes the time derivative of the end effector's Jacobian J, for joint velocities qd.
+    """Computes the time derivative of the end effector's Jacobian J.
 
-    J has a column for each joint. It changes because the axes of the joints turn with their
-    links, and because their origins and the end effector move.
+    J has one column per joint. It changes because the joint axes turn with their links, and
+    because the joints and the end effector move.
 
     Args:
-        s: State of the site (the process that runs the arm), with qd; the derivative is written
-            into `Jd`.
-        chain: Data of the joints, one row per joint. `place_end_effector` must have been called
-            before.
+        s: State of the site, with the joint velocities qd; the derivative is written into `Jd`.
+        chain: Joint data, one row per joint. `place_end_effector` must have been called before.
         tip: Position of the end effector in base axes, m.
     """
     zeros = (0.0, 0.0, 0.0)
@@ -178,23 +174,23 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
 
 @leaf
 def update_orientation_reference(s: Row, links: RowArray) -> None:
-    """Computes the orientation that the end effector should reach, and its angular velocity.
+    """Computes the desired orientation of the end effector, and its angular velocity.
 
     The reference is the orientation R_i of this arm, rotated towards the other arms. The
     rotation vector is
 
         -sum_j alpha_ij Log(R_i R_j')
 
-    where R_j is the orientation of arm j, alpha_ij the weight with which this arm follows it,
-    and Log converts a rotation matrix to a rotation vector. The angular velocity is the
-    weighted sum of the other arms' angular velocities w_j, plus the effect of changing weights:
+    where R_j is the orientation of arm j, alpha_ij the weight that this arm gives to it, and
+    Log converts a rotation matrix to a rotation vector. The angular velocity is the weighted
+    sum of the other arms' angular velocities w_j, plus the effect of changing weights:
 
         sum_j (alpha_ij w_j - alpha_ij' Log(R_i R_j'))
 
-    This velocity is exact only if the orientations agree.
+    This is exact only if the orientations agree.
 
     Args:
-        s: State of the site (the process that runs this arm); the reference is written into it.
+        s: State of the site; the reference is written into it.
         links: States of the links from the other arms, one row per link.
     """
     rotation_vector = read_three(s.x[3:])
@@ -223,7 +219,7 @@ def _divide(number: float, pivot: float) -> float:
     """Returns a number divided by a pivot of a matrix factorisation, or 0 if the pivot is 0.
 
     A pivot of J J' is 0 for a direction in which the end effector cannot move. The result 0
-    then means no motion in this direction.
+    then means no motion in that direction.
     """
     has_pivot = pivot > TINY
     return choose(has_pivot, number / choose(has_pivot, pivot, 1.0), 0.0)
@@ -231,7 +227,7 @@ def _divide(number: float, pivot: float) -> float:
 
 @leaf
 def _factor(s: Row, damping: float) -> None:
-    """Factors the matrix J J' + damping I as L D L', so that `_solve` can divide by it.
+    """Factors the matrix J J' + damping I as L D L', for use by `_solve`.
 
     J is the Jacobian of the end effector. L is a lower triangular matrix with ones on its
     diagonal, and D a diagonal matrix. They are stored together in `s.A`: D on the diagonal, and
@@ -241,12 +237,11 @@ def _factor(s: Row, damping: float) -> None:
         D_j      = B_jj - sum_{p < j} L_jp^2 D_p
 
     J has a row of zeros for each axis that is not followed. For such an axis, 1 is added to the
-    diagonal of B, so that its pivot D_j is not zero. If another pivot vanishes, the arm cannot
-    move along the axis, and L is zero in its column.
+    diagonal of B, so that its pivot D_j is not zero. If any other pivot is zero, the arm cannot
+    move along that axis, and the column of L is set to zero.
 
     Args:
-        s: State of the site (the process that runs the arm). `axes` is 1 for each axis that is
-            followed, otherwise 0.
+        s: State of the site. `axes` is 1 for each axis that is followed, otherwise 0.
         damping: The damping, in the unit of J J'. It is zero except near singular poses.
     """
     J = s.J
@@ -269,14 +264,14 @@ def _factor(s: Row, damping: float) -> None:
 
 @leaf
 def _solve(s: Row, b: Array, y: Array) -> None:
-    """Solves the linear equations L D L' y = b by forward and backward substitution.
+    """Solves the linear system L D L' y = b by forward and backward substitution.
 
-    L is a lower triangular and D a diagonal matrix. `_factor` must have computed them before;
-    it stores both in `s.A`.
+    The lower triangular matrix L and the diagonal matrix D are stored in `s.A` by `_factor`,
+    which must have been called before.
 
     Args:
-        s: State of the site (the process that runs the arm). `A` has D on its diagonal, and the
-            lower triangular matrix L below it.
+        s: State of the site. `A` has D on its diagonal, and the lower triangular matrix L below
+            it.
         b: Right-hand side, shape (m,) for m coordinates of the end effector.
         y: Receives the solution, shape (m,).
     """
@@ -295,18 +290,18 @@ def _solve(s: Row, b: Array, y: Array) -> None:
 
 @leaf
 def _factor_damped(s: Row) -> None:
-    """Factors J J', with a damping near singular poses, where the arm can hardly move.
+    """Factors J J', adding damping near singular poses.
 
-    J is the Jacobian of the end effector. The number 1 / trace((J J')^-1) is a lower bound of
-    the square of the least singular value of J. If this number is below the square of
-    `s.singular_value`, the damping is the difference, otherwise zero. The trace covers the axes
-    that are followed. It is computed from the factors without damping, by solving for each
-    column of the inverse.
+    J is the Jacobian of the end effector. 1 / trace((J J')^-1) is a lower bound of the square
+    of the smallest singular value of J. If this bound is below the square of
+    `s.singular_value`, the damping is the difference, otherwise zero. The trace covers the
+    followed axes. It is computed from the undamped factors by solving for each column of the
+    inverse.
 
     Args:
-        s: State of the site (the process that runs the arm). J and its derivative Jd get rows
-            of zeros for axes that are not followed. The factors are written into A, see
-            `_factor`. `b` and `y` are work space.
+        s: State of the site. J and its derivative Jd get rows of zeros for axes that are not
+            followed. The factors are written into A (see `_factor`). `b` and `y` are work
+            space.
     """
     for j in range(s.shared):
         mask = s.axes[j]
@@ -341,9 +336,9 @@ def _update_axis_errors(s: Row) -> None:
     """Computes the error e of the end effector and its derivative ed, for each axis.
 
     For a position, e is the difference from the reference, m. For a pose, the last three
-    numbers of e are the rotation vector from the reference orientation to the present one, rad.
-    Both are zero along axes that the task does not follow, so that the control law does nothing
-    along them.
+    entries of e are the rotation vector from the reference orientation to the current
+    orientation, rad. Both are zero along axes that are not followed, so the control law does
+    not act along them.
     """
     for j in range(s.shared):
         s.e[j] = s.x[j] - s.q_des[j]
@@ -361,18 +356,18 @@ def _update_axis_errors(s: Row) -> None:
 
 @leaf
 def update_task_errors(s: Row) -> None:
-    """Computes the errors of the end effector, and the reference motion of the joints.
+    """Computes the errors of the end effector and the reference motion of the joints.
 
-    The results are the errors e and ed of the coordinates that are followed, the reference
-    velocity v and acceleration a of the joints, and the filtered error r = qd - v. With the
-    Jacobian J and a velocity psi that pulls the joints to a preferred posture,
+    The results are the errors e and ed of the followed coordinates, the joint reference
+    velocity v and acceleration a, and the filtered error r = qd - v. With the Jacobian J and a
+    velocity psi that pulls the joints towards a preferred posture,
 
         v = psi + J' y                J J' y     = -Lambda e - J psi
         a = dpsi/dt + d(J' y)/dt      J J' dy/dt = -Lambda de/dt - Jd psi - J dpsi/dt
                                                    - (Jd J' + J Jd') y
 
     Args:
-        s: State of the site (the process that runs the arm); the results are written into it.
+        s: State of the site; the results are written into it.
     """
     n = s.joints
     m = s.shared
@@ -430,17 +425,18 @@ def update_task_errors(s: Row) -> None:
 
 @leaf
 def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: Array) -> None:
-    """Adds the joint torque by which a control law exerts a force at the end effector.
+    """Adds the joint torque that exerts a given force at the end effector.
 
-    The force is a gain times a value, for example a stiffness times a position error. The
-    torque is factor J' (gains * values), where J is the Jacobian of the end effector.
+    The force is the product of gains and values, for example a stiffness times a position
+    error. The torque is factor J' (gains * values), where J is the Jacobian of the end
+    effector.
 
     Args:
-        s: State of the site (the process that runs the arm), with J.
-        gains: Gain per coordinate of the end effector.
-        values: Value per coordinate of the end effector.
-        factor: Factor of the force.
-        torque: The torque is added to it, shape (n,), N m.
+        s: State of the site, with J.
+        gains: Gain for each coordinate of the end effector.
+        values: Value for each coordinate of the end effector, for example the position error.
+        factor: Factor applied to the force.
+        torque: The torque is added to this array, shape (n,), N m.
     """
     for i in range(s.joints):
         for j in range(s.shared):
@@ -456,14 +452,13 @@ def update_wrench(s: Row) -> None:
 
         J J' wrench = J tau_x
 
-    where J is the Jacobian of the end effector and tau_x the exogenous torque of the joints,
-    which comes from operators and environments. The torque ON the arm is -tau_x. J J' must have
-    been factored before, with its damping near singular poses (`update_task_errors`).
+    where J is the Jacobian of the end effector and tau_x the external joint torque, due to
+    operators and environments. The torque ON the arm is -tau_x. J J', including its damping
+    near singular poses, must already have been factored (by `update_task_errors`).
 
     Args:
-        s: State of the site (the process that runs the arm), with the torque ON each joint in
-            `on_arm`, N m. The wrench is written into it, N and N m, one number per shared
-            coordinate.
+        s: State of the site, with the torque ON each joint in `on_arm`, N m. The wrench is
+            written into it, one entry per shared coordinate, N and N m.
     """
     J_tau_x = s.b
     for j in range(s.shared):

@@ -1,19 +1,20 @@
-"""Computes the dynamics, the regressor and the kinematics of the planar two-link arm.
+"""Dynamics, regressor and kinematics of the planar two-link arm.
 
-Symbols: q are the joint angles, rad, qd their velocities, rad/s, g is the gravitational
-acceleration, m/s^2, `lengths` are the lengths of the two links, m, and theta are the five
+Symbols: q and qd are the joint angles, rad, and velocities, rad/s; g is the gravitational
+acceleration, m/s^2; `lengths` are the lengths of the two links, m; and theta holds the five
 dynamic parameters, which combine masses, lengths and inertias. The regressor is the matrix
-whose product with theta is the torque of the arm's dynamics. Angles are measured from the
-horizontal; the second angle is relative to the first link.
+whose product with theta is the torque of the arm's dynamics. The first angle is measured from
+the horizontal, the second from the first link.
 
 Source: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty",
 Eq. (1)-(5), (8), (12), (24). Eq. (24) prints theta_5 = m2 l2, which holds only for lc2 = l2;
 here theta_5 = m2 lc2.
 
 Invariant:
-    - Each dynamic term is linear in theta, Eq. (5), and depends on theta, shape (5,), instead
-      of lengths and masses.
-    - Vectors are read by index and returned as tuples, matrices as tuples of rows (`vectors`).
+    - The dynamic terms are linear in theta, shape (5,), Eq. (5). They do not depend on lengths
+      and masses in any other way.
+    - Vectors are read by index and returned as tuples. Matrices are returned as tuples of rows
+      (see `vectors`).
 """
 
 from typing import NamedTuple
@@ -30,8 +31,8 @@ from .elementary import sincos
 class ArmLinks(NamedTuple):
     """Lengths, masses and inertias of the two links of a planar arm.
 
-    These are the quantities that one measures on a real arm. `theta` converts them to the five
-    parameters in which the equations of motion are linear.
+    These quantities can be measured on a real arm. `theta` converts them to the five parameters
+    in which the equations of motion are linear.
 
     Attributes:
         l1_m: Length of the first link, m.
@@ -54,13 +55,10 @@ class ArmLinks(NamedTuple):
     I2_kg_m2: float
 
     def theta(self) -> Array:
-        """Returns the parameters theta on which the dynamics of the arm depend, Eq. (24).
+        """Returns the dynamic parameters theta of the arm, shape (5,), Eq. (24).
 
         The torque of the arm is linear in theta. The first three entries are inertial, in kg
         m^2; the last two belong to gravity, in kg m.
-
-        Returns:
-            The parameters, shape (5,).
         """
         l1, m1, lc1, I1, _, m2, lc2, I2 = self
         inner_inertia = m1 * lc1**2
@@ -75,7 +73,7 @@ class ArmLinks(NamedTuple):
 
 @leaf
 def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the inertia matrix M(q) of the planar arm, two rows, kg m^2 (Section IV).
+    """Returns the inertia matrix M(q) of the planar arm as two rows, kg m^2 (Section IV).
 
         M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
             | theta_3 + theta_2 cos(q2)      theta_3                   |
@@ -115,12 +113,12 @@ def gravity(theta: Vector, g: float, q: Vector) -> Pair:
 
 @leaf
 def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Five, Five]:
-    """Returns the regressor Y(q, qd, v, a), two rows of five numbers.
+    """Returns the regressor Y(q, qd, v, a), as two rows of five elements.
 
         Y theta = M(q) a + C(q, qd) v + G(q)
 
-    The vector theta has five parameters, see `ArmLinks.theta`: three of the inertia and two
-    of gravity. With qi the angle of joint i, the equation of motion in these parameters is
+    The vector theta has three inertial and two gravity parameters (see `ArmLinks.theta`). With
+    qi the angle of joint i, the equation of motion in these parameters is
 
         M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
             | theta_3 + theta_2 cos(q2)      theta_3                   |
@@ -131,8 +129,8 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
         G = g | theta_4 cos(q1) + theta_5 cos(q1 + q2) |
               | theta_5 cos(q1 + q2)                   |
 
-    Column j of Y contains the factors of theta_j. The paper prints Y(q, qd, qdd) only, Eq. (5),
-    which is the case v = qd and a = qdd. Eq. (12) needs the two velocities separately.
+    Column j of Y contains the factors of theta_j. The paper prints only Y(q, qd, qdd), Eq. (5),
+    which is the case v = qd and a = qdd, but Eq. (12) needs the two velocities separately.
 
     Args:
         g: Gravitational acceleration, m/s^2.
@@ -142,7 +140,7 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
         a: Reference acceleration, which M multiplies, rad/s^2.
 
     Returns:
-        The rows of Y for the torques of the first and the second joint.
+        The rows of Y for the first and the second joint.
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
@@ -167,7 +165,7 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
 
 @leaf
 def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vector) -> Pair:
-    """Computes the joint accelerations of the planar arm that a torque causes.
+    """Computes the joint accelerations of the planar arm caused by a torque.
 
         qdd = M(q)^-1 (torque - C(q, qd) qd - G(q))
 
@@ -178,7 +176,7 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
         g: Gravitational acceleration, m/s^2.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
-        torque: Total torque of motors, operators and environments on the joints, N m.
+        torque: Total joint torque of motors, operators and environments, N m.
 
     Returns:
         The accelerations qdd of the two joints, rad/s^2.
@@ -209,17 +207,17 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
 
 @leaf
 def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the positions of the elbow and of the end effector of the planar arm, m.
+    """Returns the positions of the elbow and the end effector of the planar arm, m.
 
-    The origin is the shoulder, with x to the right and y up. With both angles 0, the arm is
-    stretched along x.
+    The origin is the shoulder, with x to the right and y up. If both angles are 0, the arm is
+    stretched out along x.
 
     Args:
         lengths: Lengths of the two links, m.
         q: Joint angles, rad.
 
     Returns:
-        The position (x, y) of the elbow and that of the end effector, from the base, m.
+        The position (x, y) of the elbow, and the position of the end effector, m.
     """
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
@@ -236,15 +234,15 @@ def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
 def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
     """Returns the Jacobian J of the planar arm's end effector, as two rows.
 
-    J qd is the velocity of the end effector (m/s) at the joint velocities qd (rad/s), and J' F
-    is the joint torque that corresponds to a force F at the end effector.
+    J qd is the velocity of the end effector (m/s) for joint velocities qd (rad/s), and J' F is
+    the joint torque equivalent to a force F at the end effector.
 
     Args:
         lengths: Lengths of the two links, m.
         q: Joint angles, rad.
 
     Returns:
-        Rows x and y, with a column per joint, m/rad.
+        The rows for x and y, with one column per joint, m/rad.
     """
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])

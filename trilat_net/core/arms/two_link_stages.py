@@ -1,13 +1,13 @@
-"""Computes the parts of a control period that depend on the arm, for the planar two-link arm.
+"""The parts of a control period that depend on the arm model, for the planar two-link arm.
 
 `kernel` computes a control period (tick) in eight stages. Some of them, such as the torque of
-the control law, need the dynamics of the arm. This module contains these stages for two joints.
-The equations of the two joints are written one below the other, without loops, so that the
-compiled code keeps the numbers in registers.
+the control law, need the dynamics of the arm. This module implements these stages for two
+joints. The equations of both joints are written out without loops, which lets the compiled code
+keep all values in registers.
 
 Invariant:
-    - `chain_stages` has the same functions for a chain of n joints. They have one more
-      argument, the rows of the joints. `kernel` calls the functions of one module or the other.
+    - `chain_stages` provides the same functions for a chain of n joints, with the joint rows as
+      an additional argument. `kernel` uses one module or the other.
 """
 
 from math import inf, isfinite
@@ -24,15 +24,14 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def update_errors(s: Row) -> None:
-    """Computes the tracking errors of the planar arm, and the regressor of its dynamics.
+    """Computes the tracking errors of the planar arm and the regressor of its dynamics.
 
-    The results are the errors e of the position and ed of the velocity, the filtered error r,
-    the regressor Y, and the product Y' r. The regressor is the matrix whose product with the
-    dynamic parameters of the arm is a torque. Y' r drives the estimate of these parameters.
+    The results are the position error e, the velocity error ed, the filtered error r, the
+    regressor Y and the product Y' r. Y times the dynamic parameters of the arm is a torque, and
+    Y' r drives the estimate of these parameters.
 
     Args:
-        s: State of the site (the process that runs the arm), with q, qd and the reference; the
-            results are written into it.
+        s: State of the site, with q, qd and the reference; the results are written into it.
     """
     q = read_pair(s.q)
     qd = read_pair(s.qd)
@@ -52,16 +51,16 @@ def update_errors(s: Row) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Advances the adaptive control law's estimate of the arm's parameters by a time step.
+    """Advances the adaptive law's estimate of the arm's parameters by one time step.
 
-    Each parameter, such as an inertia, is then limited to its lower and upper bound, so that
-    the estimate stays plausible.
+    Each parameter, such as an inertia, is then clipped to its lower and upper bound, which
+    keeps the estimate plausible.
 
     Args:
-        s: State of the site (the process that runs the arm), with the estimate, its gains and
-            its bounds; the estimate is changed.
+        s: State of the site, with the estimate, its gains and its bounds; the estimate is
+            modified.
         gain_s: Duration of the step, s.
-        Yr: Product Y' r of the regressor Y and the filtered error r, shape (5,).
+        Yr: The product Y' r, where Y is the regressor and r the filtered error, shape (5,).
     """
     estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
     projected = control.project_estimate(estimate, s.low, s.high)
@@ -70,22 +69,23 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row) -> None:
-    """Computes the motor torque of a built-in control law, limited to the range of the motors.
+    """Computes the motor torque of a built-in control law, limited to the motors' range.
 
     The adaptive law estimates the parameters of the arm:
 
         tau = Y theta_hat - Kp r - Kd ed - rho r / sqrt(r^2 + width^2)
 
-    The last term is its robust term, a torque of at most rho against disturbances. It is left
-    out if rho is 0. The other law compensates a known gravity torque G:
+    The last term is the robust term, a torque of at most rho that counteracts disturbances. It
+    is omitted if rho is 0. The other law compensates for a known gravity torque G:
 
         tau = G(q) - K e - d qd - Kd ed + k_f felt
 
-    `control` explains the symbols, see `adaptive_torque`, `robust_torque` and `damped_torque`.
+    The symbols are explained in `control`; see `adaptive_torque`, `robust_torque` and
+    `damped_torque`.
 
     Args:
-        s: State of the site (the process that runs the arm), with the errors and the gains of
-            each joint; the torque is written into it.
+        s: State of the site, with the errors and the gains of each joint; the torque is written
+            into it.
     """
     # The limit applies to the sum of all terms, below.
     no_limit = inf
@@ -127,13 +127,13 @@ def update_torque(s: Row) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, torque: Array) -> None:
-    """Computes the joint torque of gravity on the planar arm, with its true dynamic parameters.
+    """Computes the gravity torque at the joints of the planar arm, using its true parameters.
 
-    The controller may not know these parameters; `put_gravity` takes them as an argument.
+    The controller may not know these parameters. `put_gravity` takes the parameters as an
+    argument instead.
 
     Args:
-        s: State of the site (the process that runs the arm), with the joint angles and
-            parameters.
+        s: State of the site, with the joint angles and the true parameters.
         torque: Receives the gravity torque, shape (2,), N m.
     """
     put_gravity(s, s.theta, torque)
@@ -141,12 +141,13 @@ def put_gravity_torque(s: Row, torque: Array) -> None:
 
 @leaf
 def put_gravity(s: Row, theta: Array, torque: Array) -> None:
-    """Computes the torque that holds the planar arm against gravity, for the given parameters.
+    """Computes the torque that holds the planar arm against gravity, for given parameters.
 
-    The last two columns of the regressor, g cos q_1 and g cos(q_1 + q_2), belong to gravity.
+    The last two columns of the regressor, g cos q_1 and g cos(q_1 + q_2), are the gravity
+    terms.
 
     Args:
-        s: State of the site (the process that runs the arm), after `update_errors`.
+        s: State of the site, after `update_errors`.
         theta: Parameters of the arm, shape (5,).
         torque: Receives the torque, shape (2,), N m.
     """
@@ -157,10 +158,10 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
 
 @leaf
 def update_model(s: Row) -> None:
-    """Computes the dynamics of the planar arm that a control law written by a user may read.
+    """Computes the dynamic model that a user-written control law can read, for the planar arm.
 
-    The model consists of the gravity torque G. If the law asks for them, it also contains the
-    inertia matrix M and the bias torque C qd + G, where C is the Coriolis matrix.
+    The model always contains the gravity torque G. On request it also contains the inertia
+    matrix M and the bias torque C qd + G, where C is the Coriolis matrix.
     """
     put_gravity(s, s.known, s.G)
     if s.needs_model != 0:
@@ -187,16 +188,16 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque that the sampled or the other operators and environments exert.
+    """Computes the torque exerted by one group of operators and environments.
 
-    A sampled operator or environment of the planar arm is evaluated once per period of the
-    control loop, and its torque is constant until the next period. All others act continuously.
+    The two groups are the sampled ones, whose torque is evaluated once per control period and
+    then held constant, and all others, which act continuously on the planar arm.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: Settings of the site (the process that runs the arm).
+        s: Settings of the site.
         state: Two joint angles in rad, followed by two joint velocities in rad/s.
-        actors: Operators and environments, one row for each.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
         sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
         torque: Receives the torque on the arm, shape (2,), N m.
@@ -219,22 +220,22 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque that operators and environments exert on the planar arm now.
+    """Computes the current torque of operators and environments on the planar arm.
 
-    It is the sum of up to three parts:
+    The torque is the sum of up to three parts:
 
-    - The torque of the sampled operators and environments. They are evaluated once per period
-      of the control loop, and their torque is held until the next period.
-    - The torque of all others, which act continuously. It is computed again while the arm moves
+    - The torque of the sampled operators and environments, which is evaluated once per control
+      period and then held constant.
+    - The torque of all others, which act continuously. It is recomputed while the arm moves
       during the period.
-    - If the arm is real or simulated elsewhere (`external`), the torque that was measured.
+    - If the arm is real or simulated elsewhere (`external`), the measured torque.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: State of the site (the process that runs the arm); written. `on_arm` receives the
-            whole torque and `held` the first part, N m. `wall_n` receives the largest force of
-            a wall, N. `sensed` is the measured torque, N m.
-        actors: Operators and environments, one row for each.
+        s: State of the site; modified. `on_arm` receives the total torque and `held` the first
+            part, N m. `wall_n` receives the largest wall force, N. `sensed` is the measured
+            torque, N m.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     q = read_pair(s.q)
@@ -259,7 +260,7 @@ def update_external_torque(
 
 @leaf
 def _add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
-    """Returns x + step_s * rate: two joint values after the time `step_s` at constant rates."""
+    """Returns x + step_s * rate: two joint values after `step_s` seconds at constant rates."""
     first = x[0] + step_s * rate[0]
     second = x[1] + step_s * rate[1]
     return first, second
@@ -277,10 +278,10 @@ def find_stage_acceleration(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> Pair:
-    """Computes the joint accelerations for one of the four stages of the Runge-Kutta method.
+    """Computes the joint accelerations at one of the four Runge-Kutta stages.
 
     The torque is the sum of u, which is constant during the control period, and the torque of
-    the operators and environments at the time and state of the stage.
+    operators and environments at the time and state of the stage.
 
     Args:
         t_s: Time of the stage, s since the start of the session.
@@ -290,7 +291,7 @@ def find_stage_acceleration(
         theta: Parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
-        actors: Operators and environments, one row for each.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     on_arm = torque_on_arm(
@@ -315,15 +316,15 @@ def advance_stage(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> tuple[Pair, Pair]:
-    """Computes the state and the acceleration of stage 2, 3 or 4 of the Runge-Kutta method.
+    """Computes the state and the acceleration at Runge-Kutta stage 2, 3 or 4.
 
-    The method evaluates the acceleration of the arm at four states (stages) per control period.
-    The state of a stage is the start of the period plus `ahead_s` times the derivatives of the
-    previous stage.
+    The Runge-Kutta method evaluates the acceleration of the arm at four states (stages) per
+    control period. The state of a stage is the state at the start of the period plus `ahead_s`
+    times the derivatives at the previous stage.
 
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.
-        ahead_s: Time of the stage after the beginning of the period, s.
+        ahead_s: Time from the beginning of the period to the stage, s.
         q: Joint angles at the beginning of the period, rad.
         qd: Joint velocities at the beginning of the period, rad/s.
         qd_before: Joint velocities at the previous stage, rad/s.
@@ -332,7 +333,7 @@ def advance_stage(
         theta: Parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
-        actors: Operators and environments, one row for each.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
@@ -367,14 +368,14 @@ def combine_stages(
     qdd_3: Vector,
     qdd_4: Vector,
 ) -> tuple[Pair, Pair]:
-    """Completes the Runge-Kutta method: combines its four stages to the motion after a period.
+    """Completes the Runge-Kutta method: computes the state at the end of the period.
 
         q(t + h) = q(t) + h/6 (qd_1 + 2 qd_2 + 2 qd_3 + qd_4)        and the same for qd, qdd
 
     Args:
         h_s: The period h, s.
-        q: Joint angles at the beginning, rad.
-        qd: Joint velocities at the beginning, which are those of stage 1, rad/s.
+        q: Joint angles at the beginning of the period, rad.
+        qd: Joint velocities at the beginning of the period (stage 1), rad/s.
         qd_2: Joint velocities at stage 2, rad/s.
         qd_3: Joint velocities at stage 3, rad/s.
         qd_4: Joint velocities at stage 4, rad/s.
@@ -408,20 +409,20 @@ def rk4_step(
 ) -> tuple[Pair, Pair]:
     """Simulates the motion of the planar arm over one period of the control loop.
 
-    The method is the classical Runge-Kutta method of fourth order. Operators and environments
-    act continuously, except for those that are marked as sampled.
+    Uses the classical fourth-order Runge-Kutta method. Operators and environments act
+    continuously, except those marked as sampled.
 
     Args:
         t_s: Time at the beginning of the period, in s since the start of the session.
         h_s: The period, s.
         q: Joint angles at the beginning, rad.
         qd: Joint velocities at the beginning, rad/s.
-        u: Torque that is constant over the period, shape (2,), N m: the torque of the motors,
-            and of sampled operators and environments.
+        u: Torque held constant over the period, shape (2,), N m: the motors plus the sampled
+            operators and environments.
         theta: Dynamic parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
-        actors: Operators and environments, one row for each.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
@@ -493,11 +494,11 @@ def rk4_step(
 def move_arm(s: Row, q: Pair, qd: Pair) -> bool:
     """Writes joint angles and velocities into the state of an arm, if all are finite.
 
-    A simulation that has become unstable thus stops with its last finite state, instead of
-    filling the log with NaN.
+    A simulation that has become unstable then stops at its last finite state and does not fill
+    the log with NaN.
 
     Returns:
-        True if all numbers are finite. Otherwise False, and the state is unchanged.
+        True if all values are finite. Otherwise False, and the state is unchanged.
     """
     is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
     if not is_finite:
@@ -511,7 +512,7 @@ def move_arm(s: Row, q: Pair, qd: Pair) -> bool:
 def advance_arm(
     t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> bool:
-    """Simulates the motion of the arm in one period (Runge-Kutta method of fourth order).
+    """Simulates the motion of the arm over one period (fourth-order Runge-Kutta method).
 
     The torque `s.u` is constant during the period. The joint angles q and velocities qd at the
     end of the period are written into the state of the site.
@@ -519,8 +520,8 @@ def advance_arm(
     Args:
         t_s: Time at the beginning of the period, s since the start of the session.
         h_s: The period, s.
-        s: State of the site (the process that runs the arm); written.
-        actors: Operators and environments, one row for each.
+        s: State of the site; modified.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:

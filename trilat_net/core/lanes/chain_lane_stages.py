@@ -1,14 +1,14 @@
-"""Computes one control period of an arm of n joints, for several simulations at once.
+"""Computes one control period of an arm with n joints, for several simulations at once.
 
-`lane_stages` does the same for planar arms. The recursions from joint to joint are computed for
-eight runs at a time, with `lane_vectors`. All other stages are loops over the runs, each of
+`lane_stages` does the same for planar arms. Recursions from joint to joint are computed for
+eight runs at a time, using `lane_vectors`. All other stages are loops over the runs, each of
 which has its own lane (position in the vector registers).
 
 Invariant:
-    - No equation is repeated here. The functions and the order of the stages are those of
+    - No equation is repeated here. The functions, and the order of the stages, are those of
       `kernel`.
-    - The frames of the joints of all lanes are up to date wherever a function of one lane needs
-      them. Therefore `place_joints` does nothing in one lane.
+    - The joint frames of all lanes are up to date whenever a single-lane function needs them.
+      `place_joints` therefore does nothing in a single lane.
 """
 
 from collections.abc import Callable
@@ -45,24 +45,24 @@ _GLIDE = int(StaleAction.GLIDE)
 
 
 def _place_nothing(_chain: Any, _q: Any) -> None:
-    """Does nothing. This is the version of `place_joints` for one lane.
+    """Does nothing. This is the version of `place_joints` for a single lane.
 
-    The frames of the joints of all runs have been computed before, eight runs at a time.
+    The joint frames of all runs have already been computed, eight runs at a time.
     """
 
 
 def _put_no_gravity(_s: Any, _chain: Any, _q: Any, _torque: Any) -> None:
-    """Does nothing. This is the version of `put_gravity_torque` for one lane.
+    """Does nothing. This is the version of `put_gravity_torque` for a single lane.
 
-    The torques of all runs have been computed before, eight runs at a time.
+    The torques of all runs have already been computed, eight runs at a time.
     """
 
 
 def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `place_joints` for a single simulation or for eight at once.
 
-    `place_joints` computes the positions of the joints of an arm. Numba calls this function
-    with the types of the arguments, which tell the number of simulations.
+    `place_joints` computes the positions of an arm's joints. Numba calls this function with the
+    argument types, which depend on the number of simulations.
     """
     dispatcher: Any = place_joints
     is_one_lane = isinstance(argument_types[0], RowsInLane)
@@ -72,7 +72,7 @@ def _choose_place(argument_types: tuple[Any, ...]) -> Callable[..., None]:
 def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `put_gravity_torque` for a single simulation or for eight at once.
 
-    Numba calls this function with the types of the arguments, which tell the number of
+    Numba calls this function with the argument types, which depend on the number of
     simulations.
     """
     dispatcher: Any = chain_stages.put_gravity_torque
@@ -81,11 +81,11 @@ def _choose_gravity(argument_types: tuple[Any, ...]) -> Callable[..., None]:
 
 
 def _skip(_s: Any) -> None:
-    """Version of a function with one argument that does nothing."""
+    """Version of a one-argument function that does nothing."""
 
 
 def _skip_two(_s: Any, _rows: Any) -> None:
-    """Version of a function with two arguments that does nothing."""
+    """Version of a two-argument function that does nothing."""
 
 
 def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torque: Any) -> None:
@@ -93,13 +93,13 @@ def _skip_task_torque(_s: Any, _gains: Any, _values: Any, _factor: float, _torqu
 
 
 def _skip_without_task(function: Any, skipped: Callable[..., None]) -> None:
-    """Lets Numba leave out a function of task space if the runs have no task space.
+    """Makes Numba omit a task-space function if the runs do not use task space.
 
-    Without this, Numba would compile the function, because it compiles all branches. Functions
-    of task space are called for eight runs only.
+    Otherwise, Numba would compile the function, because it compiles all branches. Task-space
+    functions are only called for eight runs at once.
 
     Args:
-        function: The function, whose first argument is the state of a site (arm controller).
+        function: The function, whose first argument is the state of a site.
         skipped: A function with the same arguments that does nothing.
     """
 
@@ -114,8 +114,8 @@ def _skip_without_task(function: Any, skipped: Callable[..., None]) -> None:
 def _choose_model(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the compiled version of `update_model`, which computes the dynamics of an arm.
 
-    Only users' control laws need the model. It is computed for eight simulated runs at a time,
-    by vector instructions, so that the version for a single run does nothing.
+    The model is only needed by users' control laws. It is computed for eight runs at a time,
+    with vector instructions, so the version for a single run does nothing.
     """
     dispatcher: Any = chain_stages.update_model
     site = argument_types[0]
@@ -166,37 +166,37 @@ def advance_chain_site(
 ) -> None:
     """Computes one control period of an arm for several simulations that run side by side.
 
-    The arm is a chain of joints, see `advance_site`. All arrays have a place (lane) for each
-    simulation. No two arrays overlap in memory.
+    The arm is a chain of joints. See `advance_site` for the planar arm. All arrays have one
+    entry (lane) per simulation, and no two arrays may overlap in memory.
 
     Args:
-        k: The tick.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the epoch.
         lanes: Number of lanes to compute, at most `LANES`.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
         block_row: Row of the tick in `used`.
-        pages: Number of latest states of each site in `states`, a power of two.
+        pages: Number of latest states stored per site in `states`, a power of two.
         bucket: Row of the tick in `peaks`.
         record_row: Row of the tick in `record`.
         site: Row of the site.
         links: Rows of its links.
         actors: Rows of its operators and environments.
-        environments: Rows of the environments alone.
-        ramps: Row with the changes of its dominance factors.
-        record: Rows with the floats of its latest records; one is written.
+        environments: Rows of its environments only.
+        ramps: Row of planned changes of its dominance factors.
+        record: Rows of its latest records; one is written.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
         law: Row with the gains and memory of the site's compiled law.
-        received: Rows with the values that the peers' laws sent.
-        sent: Row with the values that the law sends.
+        received: Rows with the values sent by the peers' laws.
+        sent: Row with the values sent by this law.
         code: Selects the code of the law, see `LawCode`.
         chain: Rows of the joints.
         states: The latest states of all sites, see `advance_site`.
         used: Sample in use by peer, lane and tick of a block; -1 before the first.
         columns: Indices of the received values, see `LaneLaw`, shape (P, C).
-        table: Tables of the operators and environments of all sites, equal in all runs.
+        table: Tables of the operators and environments of all sites, the same in all runs.
     """
     groups = (lanes + GROUP - 1) // GROUP
 

@@ -1,15 +1,14 @@
-"""Computes in advance which received states each arm uses, for a block of control periods.
+"""Computes in advance which received samples each arm uses, for a block of control periods.
 
-In each control period (tick), every arm sends its state, a sample, to the other arms over a
-simulated network. The delay and the loss of a sample depend on the link and on the number of
-the sample, but not on its content. Therefore the deliveries of many ticks can be computed
-before the arms move. Random numbers are then drawn for many samples in one call.
+The delay and loss of a sample depend on the link and on the number of the sample, but not on
+its content. The deliveries of many ticks can therefore be computed before the arms move, and
+random numbers can be drawn for many samples in one call.
 
 Example: with a delay of 3 ticks, tick 10 uses sample 7, whatever the arms do.
 
 Invariant:
-    - The samples in use are those of `accept_sample` and `release_sample`, if each sample
-      arrives at the first tick of the receiver after it was sent.
+    - The samples in use are the same as with `accept_sample` and `release_sample`, provided
+      that each sample arrives at the receiver's first tick after it was sent.
 """
 
 from collections.abc import Sequence
@@ -57,9 +56,9 @@ _UNIFORM = int(DelayKind.UNIFORM)
 class _DelayNumbers(NamedTuple):
     """Parameters of a distribution of network delays, for the function `draw_delay_us`.
 
-    The delays of successive samples (sent states) are independent. The kind of the distribution
-    may be a constant that the compiler knows. The compiler then removes the branches for other
-    kinds. See `DelayKind` for the meaning of the parameters.
+    The delays of successive samples are independent. The type of distribution may be a constant
+    known to the compiler, which then removes the branches for other types. See `DelayKind` for
+    the meaning of the parameters.
     """
 
     kind: int
@@ -72,20 +71,19 @@ class _DelayNumbers(NamedTuple):
 class LinkStates(NamedTuple):
     """State of the simulated networks of L runs, each with N sites that have P peers.
 
-    A site (arm controller) receives samples (states) from its peers, the other sites, over one
-    link per peer. The times of samples are computed for a block of ticks (control periods) at a
-    time.
+    Each site receives samples from each peer over its own link. Sample times are computed for
+    one block of ticks at a time.
 
     Attributes:
         links: States of the links, shape (L, N, P), see `LinkRow`.
-        models: Models of delay and loss, shape (L, N, P, M).
+        models: Delay and loss models, shape (L, N, P, M).
         points: Traces and outages of each run, shape (L, n, 2).
-        releases: For each tick the newest sample that is released then, or -1, shape (L, N, P,
-            R), a ring buffer. R is a power of two.
+        releases: For each tick, the newest sample that is released then, or -1. A ring buffer
+            of shape (L, N, P, R), where R is a power of two.
         newest: Sample in use at the last tick, or -1, shape (L, N, P).
-        uniforms: Buffer for two random numbers of each sample of a block.
+        uniforms: Buffer for two random numbers per sample of a block.
         delays_us: Buffer for the delay of each sample of a block, us.
-        stamps_ns: Buffer for the stamp of each sample of a block, ns.
+        stamps_ns: Buffer for the sending time of each sample of a block, ns.
         times_ns: Buffer for the nominal time of each tick of a block, ns.
         sample_counts: Buffer for the number of samples that a peer has sent before the end of
             each tick of a block.
@@ -104,17 +102,17 @@ class LinkStates(NamedTuple):
 
     @classmethod
     def copy_from(cls, tables: Sequence[SiteArrays]) -> "LinkStates":
-        """Copies the states of the network links of several runs to common arrays.
+        """Copies the network link states of several runs into shared arrays.
 
-        The runs are simulated together, each in one lane. This method is called before their
-        first tick (control period).
+        The runs are simulated together, with one run per lane. This must happen before their
+        first tick.
 
         Args:
-            tables: Arrays of all sites (arm controllers) of each run. They are not changed.
+            tables: Arrays of all sites for each run. They are not changed.
         """
         sites, peers, _ = tables[0].calendars.shape
         pages = max(arrays.calendars.shape[2] for arrays in tables)
-        # A sample that is sent in a block waits at most as long as the calendar has pages.
+        # A sample sent in a block waits for at most as many ticks as the calendar has pages.
         kept = 1 << (pages + BLOCK_TICKS).bit_length()
         most_models = max(arrays.models.shape[2] for arrays in tables)
         most_points = max(len(arrays.points) for arrays in tables)
@@ -137,13 +135,12 @@ class LinkStates(NamedTuple):
         )
 
     def keep(self, lanes: Sequence[int]) -> "LinkStates":
-        """Returns the states of the simulated network links of those runs that continue.
+        """Returns the link states of only those runs that continue.
 
-        Several runs are simulated side by side, each at one index (lane). A search drops runs
-        that it no longer needs, so that no time is spent on these runs.
+        A search drops runs that it no longer needs, because simulating them would take time.
 
         Args:
-            lanes: Indices (lanes) of the runs that continue.
+            lanes: Lane indices of the runs that continue.
         """
         chosen = list(lanes)
         return self._replace(
@@ -159,15 +156,15 @@ class LinkStates(NamedTuple):
 def _constant_delay_ns(model: Row) -> int:
     """Returns the delay of a simulated link with a constant delay, in ns.
 
-    The delay is the time from the stamp of a sample (sent state) to its use. It is at least 1
-    ns, because a sample is never used at the time at which it was sent.
+    The delay is the time from sending a sample to its use. It is at least 1 ns, because a
+    sample is never used at the time at which it was sent.
     """
     return int(max(max(clamp_delay_us(model.location), model.playout_us) * 1000, 1))
 
 
 @leaf
 def _is_constant(link: LinkRow, model: Row) -> bool:
-    """Returns True if a link only delays all samples by the same time."""
+    """Returns True if all that a link does is delay every sample by the same time."""
     return bool(
         link.models == 1
         and link.outage_count == 0
@@ -180,19 +177,19 @@ def _is_constant(link: LinkRow, model: Row) -> bool:
 def _use_after_constant_delay(
     first: int, count: int, rate_hz: int, model: Row, used: IntArray
 ) -> int:
-    """Finds the received state that an arm uses in each tick, if the delay is constant.
+    """Finds which received sample an arm uses in each tick, if the delay is constant.
 
-    Sample m is the state that the sender computed in tick (control period) m. It is used from
-    tick m + w on. The number w of ticks is the same for all samples if the period of the
-    control loop is a whole number of nanoseconds. This function must only be called in this
-    case.
+    Sample m, computed by the sender in tick m, is used from tick m + w on. The number of ticks
+    w is the same for all samples if the period of the control loop is an integer number of
+    nanoseconds. This function must only be called in that case.
 
     Args:
         first: First tick of a block of ticks.
         count: Number of ticks in the block.
         rate_hz: Tick rate of both sites, Hz.
         model: Model of the link.
-        used: Receives the sample in use, one entry per tick. -1 before the first sample.
+        used: Output array for the sample in use, one entry per tick. -1 before the first
+            sample.
 
     Returns:
         The sample in use at the end of the block.
@@ -207,7 +204,7 @@ def _use_after_constant_delay(
 def _draw_uniform_delays(
     first: int, count: int, key: DrawKey, location: float, scale: float, delays_us: IntArray
 ) -> None:
-    """Draws uniformly distributed network delays for several consecutive samples (sent states).
+    """Draws uniformly distributed network delays for several consecutive samples.
 
     Args:
         first: Index of the first sample.
@@ -215,7 +212,7 @@ def _draw_uniform_delays(
         key: Key of the link, which makes its random numbers differ from those of other links.
         location: Mean delay, us.
         scale: Largest deviation from the mean, us.
-        delays_us: Receives the delays, us, shape (count,).
+        delays_us: Output array for the delays, us, shape (count,).
     """
     numbers = _DelayNumbers(_UNIFORM, location, scale, 0.0, 0.0)
     for index in range(count):
@@ -228,10 +225,11 @@ def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -
     """Draws random numbers that decide which of several messages a simulated network loses.
 
     Args:
-        first: Index of the first sample (sent state).
+        first: Index of the first sample.
         count: Number of samples.
         key: Key of the link, which makes its random numbers differ from those of other links.
-        uniform_numbers: Receives two numbers between 0 and 1 per sample, shape (2, count).
+        uniform_numbers: Output array for two numbers between 0 and 1 per sample, shape (2,
+            count).
     """
     for index in range(count):
         u, v = uniforms(key, first + index, LOSS, 0)
@@ -242,9 +240,9 @@ def _draw_losses(first: int, count: int, key: DrawKey, uniform_numbers: Array) -
 class DrawAddresses(NamedTuple):
     """Addresses of compiled functions that draw the random numbers of many messages at once.
 
-    The numbers are delays and losses in a simulated network. The loops of these functions use
-    vector instructions, which is possible because the compiler inlines every function that they
-    call.
+    The random numbers determine delays and losses in a simulated network. The loops of these
+    functions use vector instructions, which is possible because the compiler inlines every
+    function that they call.
     """
 
     delays: int
@@ -254,8 +252,8 @@ class DrawAddresses(NamedTuple):
     def find(cls) -> "DrawAddresses":
         """Returns the addresses of compiled functions that draw network delays and losses.
 
-        Each call draws the numbers of many messages, which is faster than one call per message.
-        The functions are compiled if their machine code is not stored on disk.
+        Drawing for many messages per call is faster than one call per message. The functions
+        are compiled if their machine code is not stored on disk.
         """
         integer = types.int64
         number = types.float64
@@ -284,10 +282,9 @@ def _release_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes the ticks at which messages may be used, for one delay model of a link.
+    """Computes in which ticks samples may first be used, for one delay model of a link.
 
-    The random numbers of all messages (samples) are drawn first, in loops that use vector
-    instructions. A tick is a control period of the receiver.
+    The random numbers of all samples are drawn first, in loops that use vector instructions.
 
     Args:
         first: Index of the first sample.
@@ -295,11 +292,11 @@ def _release_samples(
         rate_hz: Tick rate of the receiver, Hz.
         least_release: First tick that can still use a sample.
         fresh: True if the first sample is also the first sample of the model.
-        stamps_ns: Stamps of the samples, ns since the epoch.
-        link: Row of the link; changed.
+        stamps_ns: Sending times of the samples, ns since the epoch.
+        link: Row of the link; updated in place.
         model: Model of the link.
         points: Traces and outages.
-        releases: Newest sample that each tick releases, a ring buffer; changed.
+        releases: Newest sample that each tick releases, a ring buffer; updated in place.
         states: Provides buffers for the random numbers.
         draws: Functions that draw them.
     """
@@ -323,7 +320,8 @@ def _release_samples(
     loses = loses_samples(model)
     if loses:
         call_address(draws.losses, (first, count, link.key, uniform_numbers))
-    # Without copies of samples and outages, the slower general function is not needed.
+    # If samples are never duplicated and there are no outages, the slower general function is
+    # not needed.
     is_plain = model.duplicate == 0.0 and link.outage_count == 0
     for index in range(count):
         sample = first + index
@@ -373,21 +371,20 @@ def _release_all_samples(
     states: LinkStates,
     draws: DrawAddresses,
 ) -> None:
-    """Computes the ticks at which the messages of a simulated network link may be used.
+    """Computes in which ticks the samples of a simulated network link may first be used.
 
-    Each message (sample) is delayed by the delay model in force at the time of sending. A tick
-    is a control period of the receiver.
+    Each sample is delayed by the delay model in force when it was sent.
 
     Args:
-        first_sample: Index of the first sample, whose stamp is `states.stamps_ns[0]`.
+        first_sample: Index of the first sample, whose sending time is `states.stamps_ns[0]`.
         end_sample: Index after that of the last sample.
         rate_hz: Tick rate of the receiver, Hz.
         least_release: First tick that can still use a sample.
-        link: Row of the link; changed.
+        link: Row of the link; updated in place.
         models: Models of the link.
         points: Traces and outages.
-        releases: Newest sample that each tick releases, a ring buffer; changed.
-        states: Contains the stamps, and provides buffers for random numbers.
+        releases: Newest sample that each tick releases, a ring buffer; updated in place.
+        states: Contains the sending times, and provides buffers for random numbers.
         draws: Functions that draw random numbers.
     """
     sample = first_sample
@@ -422,16 +419,17 @@ def _release_all_samples(
 def _use_released_samples(
     first: int, count: int, newest: int, releases: IntArray, used: IntArray
 ) -> int:
-    """Finds the newest received state that may be used in each control period of a block.
+    """Finds the newest received sample that may be used in each tick of a block.
 
-    The states (samples) have been released before, each for a control period (tick).
+    The samples have already been released, each for a certain tick.
 
     Args:
         first: First tick of the block.
         count: Number of ticks.
         newest: Sample in use before the block, or -1.
-        releases: Newest sample that each tick releases, a ring buffer; the ticks are emptied.
-        used: Receives the sample in use, one entry per tick.
+        releases: Newest sample that each tick releases, a ring buffer. The entries of these
+            ticks are cleared.
+        used: Output array for the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -459,23 +457,20 @@ def _use_samples_of_link(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the received state (sample) that an arm uses in each tick, on a link of any kind.
-
-    The link is a simulated network connection with delays and losses. A tick is a control
-    period.
+    """Finds which received sample an arm uses in each tick, on a link with any delay model.
 
     Args:
         first: First tick of the block.
         count: Number of ticks.
         rate_hz: Tick rate of both sites, Hz.
-        link: Row of the link; changed.
+        link: Row of the link; updated in place.
         models: Models of the link.
         points: Traces and outages.
-        releases: Newest sample that each tick releases, a ring buffer; changed.
+        releases: Newest sample that each tick releases, a ring buffer; updated in place.
         newest: Sample in use before the block, or -1.
         states: Provides buffers for random numbers.
         draws: Functions that draw random numbers.
-        used: Receives the sample in use, one entry per tick.
+        used: Output array for the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -506,24 +501,23 @@ def use_samples(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the received state that each arm uses in each tick of a block of control periods.
+    """Finds which received sample each arm uses in each tick of a block of control periods.
 
-    This is done for several simulations at once. A received state (sample) comes from a peer,
-    another arm, and is delayed by the simulated network.
+    This is done for several simulations at once. Samples are delayed by the simulated network.
 
     Args:
         first: First tick of the block.
         count: Number of ticks.
         rate_hz: Tick rate of all sites, Hz.
-        ended: For each lane the number of ticks of a run that has ended, else -1.
-        states: State of the links of the runs; changed.
+        ended: For each lane, the number of ticks of a run that has ended, or -1 if it has not.
+        states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
-        used: Receives the index of the sample in use, or -1 before the first sample, shape (N,
-            P, LANES, ticks).
+        used: Output array for the index of the sample in use, or -1 before the first sample,
+            shape (N, P, LANES, ticks).
 
     Returns:
-        The largest age of a sample in use, ticks. Before the first sample, it is the age that
-        the first sample would have.
+        The largest age of a sample in use, in ticks. Before the first sample, this is the age
+        that the first sample would have.
     """
     largest_age = 0
     has_whole_period = 1_000_000_000 % rate_hz == 0
@@ -566,18 +560,18 @@ def use_samples(
 def _use_after_delay(
     count: int, delay_ns: int, rate_hz: int, newest: int, states: LinkStates, used: IntArray
 ) -> int:
-    """Finds the received state that an arm uses if its peer has another control rate.
+    """Finds which received sample an arm uses in each tick if its peer has another tick rate.
 
     The delay of the network link is constant.
 
     Args:
         count: Number of ticks.
-        delay_ns: Time from the stamp of a sample to its use, ns.
+        delay_ns: Time from sending a sample to its use, ns.
         rate_hz: Tick rate of the peer, Hz.
         newest: Sample in use before the block, or -1.
-        states: Contains for each tick its time and the number of samples that the peer has
+        states: Contains the time of each tick, and the number of samples that the peer has
             sent.
-        used: Receives the sample in use, one entry per tick.
+        used: Output array for the sample in use, one entry per tick.
 
     Returns:
         The sample in use at the end of the block.
@@ -602,20 +596,21 @@ def use_samples_of_rates(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Does the work of `use_samples` for arms whose control loops have different rates.
+    """Variant of `use_samples` for arms whose control loops have different rates.
 
-    The block contains the control periods (ticks) of all arms in an interval of time. An arm
-    executes its tick before a later tick of another arm.
+    The block contains the ticks of all arms in an interval of time. Ticks of different arms are
+    executed in chronological order.
 
     Args:
         first: First tick of each site in the block, shape (N,).
         end: Tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
-        next_samples: Next sample that each site accepts from each peer, shape (N, P); changed.
+        next_samples: Next sample that each site accepts from each peer, shape (N, P); updated
+            in place.
         ended: See `use_samples`.
-        states: State of the links of the runs; changed.
+        states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
-        used: Written, see `use_samples`. The ticks are counted from `first`.
+        used: Output array, see `use_samples`, with ticks counted from `first`.
 
     Returns:
         The largest age of a sample in use, see `use_samples`, in ticks of its sender.
@@ -741,25 +736,25 @@ def use_recorded_samples(
     state: Array,
     used: IntArray,
 ) -> int:
-    """Finds the received state that each arm uses when a run from a log is repeated.
+    """Finds which received sample each arm uses when a run from a log is repeated.
 
-    All arrivals are known from the log. The results have the form of `use_samples`.
+    All arrivals are known from the log. The results have the same form as in `use_samples`.
 
     Args:
         first: First tick of each site in the block, shape (N,).
         end: Tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
         feed: Inputs of the recorded run.
-        links: Rows of the links, shape (N, P); changed.
+        links: Rows of the links, shape (N, P); updated in place.
         models: Models of the links, shape (N, P, M).
-        dues: Due times, shape (N, P, D); changed.
-        calendars: Calendars of the links, shape (N, P, pages); changed. Their samples have the
-            right index, but no content.
+        dues: Due times, shape (N, P, D); updated in place.
+        calendars: Calendars of the links, shape (N, P, pages); updated in place. Their samples
+            have the right index, but no content.
         points: Traces and outages.
-        channel: Values that laws receive, or None; changed.
-        state: Any numbers, at least as many as a site sends.
-        used: Receives the samples in use in lane 0, shape (N, P, LANES, ticks). The ticks are
-            counted from `first`.
+        channel: Values that laws receive, or None; updated in place.
+        state: An array of arbitrary content, at least as long as the state that a site sends.
+        used: Output array for the samples in use in lane 0, shape (N, P, LANES, ticks), with
+            ticks counted from `first`.
 
     Returns:
         The largest age of a sample in use, in ticks of its sender, see `use_samples_of_rates`.
@@ -808,27 +803,28 @@ def repeat_deliveries(
     joints: int,
     states: Array,
 ) -> None:
-    """Updates the simulated network links of one run, so that the run can continue alone.
+    """Brings the simulated network links of one run up to date, so that it can continue alone.
 
-    Runs that are simulated side by side (in lanes) compute the deliveries without the state of
-    the links (`use_samples`). The links are therefore executed again for the past ticks
-    (control periods), without the arms. Samples that were overwritten long ago have the wrong
-    content, but the right index.
+    Runs that are simulated side by side compute their deliveries without the link state
+    (`use_samples`). The links are therefore executed again for the past ticks, without the
+    arms. Samples that were overwritten long ago have the right index but the wrong content.
 
     Args:
         first: First tick of each site, shape (N,).
         end: Tick of each site before which its links stop, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
-        next_samples: Next sample that each site accepts from each peer, shape (N, P); changed.
-        links: Rows of the links before the first tick, shape (N, P); changed.
+        next_samples: Next sample that each site accepts from each peer, shape (N, P); updated
+            in place.
+        links: Rows of the links before the first tick, shape (N, P); updated in place.
         models: Models of the links, shape (N, P, M).
-        dues: Due times, shape (N, P, D); changed.
-        calendars: Calendars of the links, shape (N, P, pages); changed.
+        dues: Due times, shape (N, P, D); updated in place.
+        calendars: Calendars of the links, shape (N, P, pages); updated in place.
         points: Traces and outages.
         channel: Values that laws receive, or None.
         joints: Number of joints.
-        states: The latest states of the sites (q, qd, tau_x and the values that the law sent),
-            shape (N, R + 1, width). The state of tick k is at k modulo R. R is a power of two.
+        states: The latest states of the sites (q, qd, tau_x and the values sent by the law),
+            shape (N, R + 1, width). The state of tick k is at index k modulo R, where R is a
+            power of two.
     """
     mask = states.shape[1] - 2
     for i in range(links.shape[0]):

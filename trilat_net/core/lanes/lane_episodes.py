@@ -1,14 +1,14 @@
-"""Simulates several episodes at once that begin and end at different times.
+"""Simulates several episodes at once that start and end at different times.
 
-A training environment with many copies uses this module: when the episode of one copy has
-ended, a new episode takes its lane (position in the vector registers), while the others
-continue. Therefore each lane has a clock of its own. In each run, a program may move one arm.
-The caller provides the actions of all programs as an array.
+This module is used by a training environment with many copies. When the episode of one copy
+ends, a new episode takes over its lane (position in the vector registers), while the others
+continue. Each lane therefore has its own clock. In each run, a program may move one arm. The
+caller passes the actions of all programs as one array.
 
 Invariant:
-    - After each call of `advance`, a run has the state that `CompiledRun.step_to` gives it with
-      the same actions, bit for bit.
-    - A lane does not depend on the other lanes.
+    - After each call of `advance`, the state of a run is bit-identical to the one that
+      `CompiledRun.step_to` produces from the same actions.
+    - Lanes do not affect each other.
 """
 
 from collections.abc import Callable
@@ -45,9 +45,9 @@ def _use_samples_of_lanes(
     draws: DrawAddresses,
     used: IntArray,
 ) -> int:
-    """Finds the received states that the arms of all runs use in their next control periods.
+    """Finds which received samples the arms of all runs use in their next control periods.
 
-    The runs are simulated side by side (in lanes), and each run is at its own control period.
+    The runs are simulated side by side (in lanes), each at its own tick.
 
     Args:
         runs: Number of runs.
@@ -55,9 +55,9 @@ def _use_samples_of_lanes(
         count: Number of ticks.
         rate_hz: Tick rate of all sites, Hz.
         skipped: -1 for lanes that are advanced, shape (LANES,).
-        states: State of the links of the runs; changed.
+        states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
-        used: Written, see `use_samples`.
+        used: Output array, see `use_samples`.
 
     Returns:
         The largest age of a sample in use, ticks.
@@ -96,14 +96,14 @@ def _put_actions(
 ) -> None:
     """Copies the actions of all programs in a tick to the simulated operators of the arms.
 
-    In each of several runs, one program moves an arm, like an operator. The runs are stored
-    side by side, each in a lane.
+    In each of several runs, one program moves an arm in place of an operator. The runs are
+    stored side by side, one per lane.
 
     Args:
-        actions: Five numbers per action (grip and target), shape (5, LANES).
+        actions: Five values per action (grip and target), shape (5, LANES).
         hand_row: Index of the operator's row in `actors`.
-        columns: Index of each number of an action within this row, shape (5,).
-        actors: Rows of operators and environments, viewed as floats, shape (rows, numbers of a
+        columns: Index of each value of an action within this row, shape (5,).
+        actors: Rows of operators and environments, viewed as floats, shape (rows, values per
             row, LANES).
         runs: Number of runs.
     """
@@ -148,7 +148,7 @@ def _run_span(
         rate_hz: Tick rate of all sites, Hz.
         runs: Number of runs.
         settled_rad: Position error below which an arm counts as settled, rad.
-        pages: Number of latest states of each site, a power of two.
+        pages: Number of latest states stored per site, a power of two.
         mode_word: Index of the mode among the words of a site's row.
         addresses: Addresses of the code, see `run_block`.
         tables: Addresses of the tables, see `run_block`.
@@ -157,15 +157,15 @@ def _run_span(
         actions: Actions of the programs, shape (ticks, 5, LANES).
         hand_row: Row of the operator that the programs replace.
         columns: Words of an action in this row.
-        actors: Rows of operators and environments; changed.
+        actors: Rows of operators and environments; updated in place.
         states: The latest states of all sites, see `advance_site`.
         used: Samples in use, see `use_samples`.
         received_columns: Indices of the values that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
         latest: Zeros, shape (3, N), see `keep_ended_runs`: there is one bucket and one record.
         peaks: Buffer for the peaks of all sites in one bucket, which are not used.
-        present: The numbers of all runs.
-        ended: Numbers of the runs in which an arm left its limits; changed.
+        present: Current values of all runs.
+        ended: Values of the runs in which an arm left its limits; updated in place.
 
     Returns:
         The number of runs in which no arm has left its limits.
@@ -196,7 +196,7 @@ def _run_span(
                 columns=received_columns[i],
                 table=table,
             )
-        # The tick that follows.
+        # The next tick.
         for lane in range(LANES):
             clock[0, 0, lane] += 1
         running = keep_ended_runs(
@@ -217,23 +217,23 @@ def _run_span(
 class LaneEpisodes(LaneRun):
     """Simulates the episodes of several training environments together.
 
-    Each environment has a lane, an element of the vector registers, so that one instruction
-    computes a number of several environments. When an episode has ended, `load` puts a new run
-    into its lane, while the other lanes continue.
+    Each environment occupies a lane (an element of the vector registers), so that one
+    instruction computes the same quantity for several environments. When an episode has ended,
+    `load` puts a new run into its lane while the other lanes continue.
 
     Args:
         run: Any run of this structure before its first tick, see `explain_run`.
-        count: Number of lanes with a run, at most `LANES`.
-        hand_site: Index of the site whose arm a program moves.
+        count: Number of lanes that hold a run, at most `LANES`.
+        hand_site: Index of the site whose arm is moved by a program.
         hand_row: Index of its live operator among the operators of the site.
-        period_ticks: Time from one decision of the program to the next, ticks.
+        period_ticks: Time between decisions of the program, ticks.
 
     Attributes:
         ticks: Number of ticks that each run has executed, shape (LANES,).
         hands: The program's hand in each lane.
-        structure: The structure, see `RunStructure`.
-        most_runs: Largest number of lanes with a run.
-        least_runs: Number of runs from which lanes are faster than one run after the other.
+        structure: The common structure of the runs, see `RunStructure`.
+        most_runs: Largest number of lanes that hold a run.
+        least_runs: Number of runs from which lanes are faster than running them one by one.
     """
 
     clock = _CLOCK
@@ -246,8 +246,7 @@ class LaneEpisodes(LaneRun):
         """Allocates the arrays for several episodes that are simulated side by side.
 
         An episode is one simulated run in which a program, for example a learning policy, moves
-        an arm. All places (lanes) initially hold copies of the same run, until `load` replaces
-        them.
+        an arm. All lanes initially hold copies of the same run, until `load` replaces them.
         """
         super().__init__([run] * count)
         self.structure = self.find_structure(run)
@@ -270,23 +269,23 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def find_structure(run: CompiledRun) -> RunStructure:
-        """Returns the properties in which runs must agree to be simulated side by side.
+        """Returns the properties that runs must share to be simulated side by side.
 
         Examples are the number of joints and the control laws. Durations may differ, because an
-        episode (simulated run) that ends is replaced by a new episode.
+        episode that ends is replaced with a new one.
         """
         return RunStructure.find(run)._replace(duration_s=0.0)
 
     @staticmethod
     def explain_hand(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Explains why the actions of a program that moves an arm need a slower simulation.
+        """Explains why the actions of a program that moves an arm require a slower simulation.
 
-        Episodes are faster if several are simulated side by side, but this supports only some
-        actions. The explanation is "" if the actions are supported.
+        Simulating several episodes side by side is faster, but supports only some actions.
+        Returns an empty string if the actions are supported.
 
         Args:
             rules: Limits of the program's hand.
-            period_ticks: Number of ticks of a step.
+            period_ticks: Number of ticks per step.
             largest_action: Largest absolute value of any component of an action.
         """
         if period_ticks > BLOCK_TICKS:
@@ -295,14 +294,14 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_run(run: CompiledRun, hand_site: int) -> str:
-        """Explains why a run cannot be simulated side by side with others. "" if it can.
+        """Explains why a run cannot be simulated side by side with others.
 
-        The function finds the answer by compiling the code of the simulation, which can take
-        seconds.
+        Returns an empty string if it can. This compiles the simulation code to find out, which
+        can take seconds.
 
         Args:
             run: The run before its first tick.
-            hand_site: Index of the site whose arm a program moves.
+            hand_site: Index of the site whose arm is moved by a program.
         """
         obstacle = find_obstacle(run, hand_site=hand_site)
         if len(set(run.memory.tables.site["rate_hz"].ravel().tolist())) > 1:
@@ -310,15 +309,13 @@ class LaneEpisodes(LaneRun):
         return obstacle or explain_uncompilable(run, _CLOCK)
 
     def load(self, lane: int, run: CompiledRun, rules: HandRules) -> None:
-        """Starts a new episode of reinforcement learning in place of an ended episode.
+        """Starts a new reinforcement learning episode in the lane of one that has ended.
 
-        Several episodes (simulated runs) advance side by side, and each has a place in common
-        arrays (its lane). The function copies the initial state of the new run into the place.
+        The initial state of the new run is copied into the lane.
 
         Args:
             lane: Index of the lane.
-            run: The run before its first tick (control period), of the same structure as the
-                others.
+            run: The run before its first tick, with the same structure as the others.
             rules: Limits of the program's hand, see `HandRules`.
         """
         memory = run.memory
@@ -349,18 +346,18 @@ class LaneEpisodes(LaneRun):
     def _load_links(self, lane: int, run: CompiledRun) -> None:
         """Copies the state of a run's simulated network links into a lane.
 
-        A lane is the place of one of the runs that are simulated together. The arrays that all
-        lanes share are enlarged if they are too small for the delay models of this run.
+        The arrays shared by all lanes are enlarged if they are too small for the delay models
+        of this run.
 
         Args:
             lane: Index of the lane.
-            run: The run before its first tick (control period).
+            run: The run before its first tick.
         """
         tables = run.memory.tables
         links = self._deliveries
         pages = tables.calendars.shape[2]
-        # `releases` is a ring buffer over the ticks. A sample that is sent in a block of ticks
-        # waits at most as long as the calendar has pages.
+        # `releases` is a ring buffer over the ticks. A sample sent in a block of ticks waits
+        # for at most as many ticks as the calendar has pages.
         needed = 1 << (pages + BLOCK_TICKS).bit_length()
         old_room = links.releases.shape[3]
         if needed > old_room:
@@ -370,8 +367,8 @@ class LaneEpisodes(LaneRun):
                 releases[other, ..., due % needed] = links.releases[other, ..., due % old_room]
             links = links._replace(releases=releases)
 
-        # The run may have more delay models, or more points of recorded delays, than any run
-        # before.
+        # The run may have more delay models, or more points of recorded delays, than any
+        # previous run.
         models = tables.models.shape[2]
         if models > links.models.shape[3]:
             wider = np.zeros((*links.models.shape[:3], models), LINK_MODEL_DTYPE)
@@ -399,19 +396,19 @@ class LaneEpisodes(LaneRun):
         goals: Array,
         locate: Callable[[Array], Array],
     ) -> None:
-        """Simulates all episodes for a number of ticks, with the decisions of their programs.
+        """Simulates all episodes for a number of ticks, applying their programs' decisions.
 
         A run ends if one of its arms leaves its limits.
 
         Args:
             count: Number of ticks, at most `BLOCK_TICKS`.
-            is_idle: True for runs that are not advanced, shape (runs,). Unless these runs have
-                ended, their numbers have no meaning afterwards.
-            acts: True for runs in which a decision of the program begins to act at the first
+            is_idle: True for runs that are not advanced, shape (runs,). Their state is
+                meaningless afterwards, unless they have ended.
+            acts: True for runs in which a decision of the program takes effect at the first
                 tick, shape (runs,).
-            goals: The decisions that begin to act, shape (runs, 2).
-            locate: Function that returns the poses of the arm, shape (runs, 2), from its joint
-                angles, shape (runs, 2), in the coordinates of the program.
+            goals: The decisions that take effect, shape (runs, 2).
+            locate: Function that maps joint angles, shape (runs, 2), to poses of the arm, shape
+                (runs, 2), in the coordinates used by the program.
         """
         runs = len(self.runs)
         idle = np.ones(LANES, np.int64)
@@ -436,7 +433,7 @@ class LaneEpisodes(LaneRun):
         self._step_span(count, idle)
 
     def _step_span(self, count: int, idle: IntArray) -> None:
-        """Simulates all runs for several control periods, with the actions of their programs.
+        """Simulates all runs for several control periods, applying their programs' actions.
 
         Args:
             count: Number of ticks.
@@ -488,10 +485,9 @@ class LaneEpisodes(LaneRun):
         self.ticks[idle == 0] += count
 
     def _keep_states(self, ticks: int) -> None:
-        """Enlarges the memory for past states of the sites (arm controllers), if necessary.
+        """Enlarges the memory for past states of the sites, if necessary.
 
-        Each lane (position of a run among the runs that are simulated together) has a present
-        tick (control period) of its own.
+        Each lane has its own current tick.
         """
         while self._pages <= ticks:
             old_pages = self._pages
@@ -505,17 +501,17 @@ class LaneEpisodes(LaneRun):
 
     @property
     def has_ended(self) -> NDArray[np.bool_]:
-        """States which of the simulated runs ended early because an arm left its safety limits.
+        """Returns which of the runs ended early because an arm left its safety limits.
 
-        The array has the shape (runs,), with True for a run that ended.
+        The array has shape (runs,), and is True for each run that ended.
         """
         return self._ended.ticks[: len(self.runs)] >= 0
 
     def read_site(self, name: str) -> NDArray[Any]:
-        """Returns one quantity of all N sites (controllers of one arm each) in all runs.
+        """Returns one quantity of all N sites in all runs.
 
-        The array has the shape (N, runs, numbers). For "q", for example, the numbers are the
-        angles of the joints.
+        The array has shape (N, runs, elements). For "q", for example, the elements are the
+        joint angles.
 
         Args:
             name: Name of the quantity, a field of `SiteRow`, for example "q".
@@ -526,8 +522,7 @@ class LaneEpisodes(LaneRun):
     def read_links(self, name: str, i: int) -> NDArray[Any]:
         """Returns one quantity of the network links over which site `i` receives, in all runs.
 
-        A site is the controller of one arm. The array has the shape (P, runs, numbers), for
-        links from P other sites.
+        The array has shape (P, runs, elements), for links from P peers.
         """
         dtype: Any = self._layout.link.fields[name][0]  # type: ignore[index]
         rows = slice(i * self._structure.peers, (i + 1) * self._structure.peers)
@@ -543,13 +538,13 @@ class LaneEpisodes(LaneRun):
         name: str,
         dtype: np.dtype[Any],
     ) -> NDArray[Any]:
-        """Returns one field of the state of all sites (arm controllers) or links, for each run.
+        """Returns one field of the state of all sites or links, for each run.
 
-        Several runs are stored side by side, each in a lane. The state of a run that has ended
-        is read from `ended`, because its lane no longer contains valid numbers.
+        For a run that has ended, the field is read from `ended`, because its lane no longer
+        contains valid values.
 
         Args:
-            present: Present rows of all lanes, shape (rows, values per row, LANES).
+            present: Current rows of all lanes, shape (rows, values per row, LANES).
             ended: The same rows at the end of each run that has ended.
             layout: Data type of a row.
             name: Name of the field.
@@ -566,10 +561,9 @@ class LaneEpisodes(LaneRun):
         return in_order.view(dtype.base)
 
     def read_new(self, i: int) -> NDArray[np.bool_]:
-        """Returns True for each peer whose new sample site `i` used in its latest tick.
+        """For each peer, returns True if site `i` used a new sample in its latest tick.
 
-        A sample is the state that a peer, one of P other sites (arm controllers), sent. The
-        shape is (P, runs).
+        The shape is (P, runs) for P peers.
         """
         runs = len(self.runs)
         lanes = np.arange(runs)
@@ -582,10 +576,10 @@ class LaneEpisodes(LaneRun):
         return is_new
 
     def write_back(self, lane: int) -> None:
-        """Copies the present state of a run into its `CompiledRun`, where callers read it.
+        """Copies the current state of a run into its `CompiledRun`, where callers read it.
 
-        The run cannot continue alone from this state, because its simulated network links still
-        have their initial state.
+        The run cannot continue alone from this state, because its simulated network links are
+        still in their initial state.
 
         Args:
             lane: Index of the run among the runs that are simulated together.

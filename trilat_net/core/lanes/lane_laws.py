@@ -2,15 +2,15 @@
 # mypy: disable-error-code="no-any-return"
 """Compiles control laws into the simulation of several runs at once.
 
-Laws such as `tdpa`, and those that users write, are classes with a method `torque`. In a single
-run, the simulation calls the compiled method by its address. For several runs, each in one lane
-of the vector registers, the method is compiled as a part of the control period instead. This
-saves the call and the checks of the vector lengths, which are constants in this case.
+Laws such as `tdpa`, and those that users write, are classes with a method `torque`. A single
+run calls the compiled method by its address. For several runs, with one run per lane of the
+vector registers, the method is compiled into the control period instead. This saves the call,
+and also the checks of the vector lengths, which are constants in this case.
 
 Invariant:
     - The method is not changed. It raises the same errors, and reads and writes the same
-      numbers, as in a run that is computed alone.
-    - A user's law is compiled in each process, because the other files that it uses are
+      values, as in a run that is computed alone.
+    - A user's law is compiled in every process, because the other files that it uses are
       unknown. The code of a built-in law is stored under a hash of its sources.
 """
 
@@ -36,22 +36,22 @@ from .lane_rows import Constants, LaneTable, RowsInLane, offset_rows
 
 _DIVERGED = int(Mode.DIVERGED)
 NO_LAW = "none"
-"""Name of the law of a site whose law is a part of the kernel."""
+"""Law name of a site whose law is part of the kernel."""
 
 
 class LaneLaw(NamedTuple):
     """Properties of a control law on which the compiled code of a simulation depends.
 
-    Runs for which these properties are equal share the code.
+    Runs share the code if these properties are equal.
 
     Attributes:
-        name: Name that identifies the code of the law. `NO_LAW` for laws of the kernel.
+        name: Identifies the code of the law. `NO_LAW` for laws of the kernel.
         is_stored: True if the compiled code may be stored on disk.
         size: Number of gains and memory values of the law.
-        constants: Names and values of flags among these numbers: integers that are 0 or 1 and
-            do not change. They are equal in all runs.
-        columns: For each other site (peer), the indices of the values that the law receives
-            among the values that the peer sends. -1 for a value that the peer does not send.
+        constants: Names and values of the flags among these values, which are integers equal to
+            0 or 1 that never change. They are equal in all runs.
+        columns: For each peer, the indices of the values that the law receives among the values
+            that the peer sends, or -1 for a value that the peer does not send.
     """
 
     name: str
@@ -64,13 +64,12 @@ class LaneLaw(NamedTuple):
     def describe(cls, law: CompiledLaw | None, columns: Any) -> "LaneLaw":
         """Returns the properties of a control law on which the code of a simulation depends.
 
-        Several runs can be simulated side by side by the same code only if these properties are
-        equal.
+        The same code can simulate several runs side by side only if these properties are equal.
 
         Args:
-            law: The law. None if the law of the site (arm controller) is a part of the kernel.
-            columns: Indices of the C values that the law receives from each of P peers (other
-                sites), shape (P, C).
+            law: The law, or None if the site's law is part of the kernel.
+            columns: Indices of the C values that the law receives from each of P peers, shape
+                (P, C).
         """
         if law is None:
             return cls(NO_LAW, is_stored=True, size=0, constants=(), columns=())
@@ -80,8 +79,7 @@ class LaneLaw(NamedTuple):
         row = law.row[:size].view(form.law)[0]
         constants = []
         for field, (dtype, *_) in (form.law.fields or {}).items():
-            # Other integers are not constants, because a study may vary them within one
-            # structure.
+            # Other integers are not constants, because a study may vary them for one structure.
             if dtype.kind == "i" and not dtype.shape and row[field] in (0, 1):
                 constants.append((field, int(row[field])))
         return cls(
@@ -101,7 +99,7 @@ class _LawMethod(NamedTuple):
 
 
 _METHODS: dict[str, _LawMethod] = {}
-"""Methods of laws by the names of the laws."""
+"""Methods of laws, keyed by the name of the law."""
 _user_law_numbers = count()
 
 
@@ -109,8 +107,8 @@ _user_law_numbers = count()
 def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
     """Returns a name that identifies the code of a law, and whether it may be stored on disk.
 
-    Compiled code is stored under the name. Code of users is not stored, because it may use
-    other files, whose changes would not be noticed.
+    Compiled code is stored under this name. User code is not stored, because it may use other
+    files, and changes to these would go unnoticed.
     """
     sources = digest_sibling_sources(torque)
     text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
@@ -122,9 +120,9 @@ def _name_law(torque: Callable[..., Any], form: LawForm) -> tuple[str, bool]:
 
 
 class LawCode(types.Type):
-    """Numba's type of an argument that tells the compiler which control law to call.
+    """Numba type of an argument that tells the compiler which control law to call.
 
-    The argument has no value at run time: its type alone selects the code.
+    The argument has no value at run time. The code is selected by its type alone.
 
     Args:
         law: The law.
@@ -140,14 +138,14 @@ class LawCode(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return "LawCode", (f"c{digest[:16]}",)
 
 
 @register_model(LawCode)
 class _CodeModel(models.PrimitiveModel):
-    """Represents a `LawCode` in machine code by a pointer that is not used."""
+    """Represents a `LawCode` in machine code as an unused pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -156,16 +154,16 @@ class _CodeModel(models.PrimitiveModel):
 def _make_view(
     dtype: np.dtype[Any] | None, rows: int, first_word: int, constants: Constants = ()
 ) -> Any:
-    """Returns a compiled function that views a vector of plain numbers as named fields.
+    """Returns a compiled function that views an unstructured vector as named fields.
 
-    A control law declares the names of its gains and of the numbers that it sends. The arrays
-    of the simulation store them as plain numbers. The function converts no numbers. It only
-    views the same memory with another type.
+    A control law declares the names of its gains and of the values that it sends, while the
+    arrays of the simulation store them without names. The function converts nothing; it only
+    views the same memory as another type.
 
     Args:
-        dtype: Names and types of the fields. None if there are no such numbers.
+        dtype: Names and types of the fields. None if there are no such values.
         rows: Number of rows, each of which has these fields.
-        first_word: Index of the number at which the first row begins.
+        first_word: Index of the value at which the first row starts.
         constants: Names and values of fields that are equal in all runs.
     """
     if dtype is None:
@@ -219,21 +217,21 @@ def compute_law(
 ) -> None:
     """Computes the torque of a compiled control law in one tick, for one of several runs.
 
-    Nothing happens if the law of the site is a part of the kernel, which computes such laws
-    itself. The function body is only a placeholder: the compiler replaces it by the version of
-    the law that the type of `code` selects (`_choose_law`).
+    Does nothing if the site's law is part of the kernel, which computes such laws itself. The
+    function body is only a placeholder: the compiler replaces it with the version of the law
+    selected by the type of `code` (`_choose_law`).
 
     Args:
         code: Tells the compiler which law to call.
-        k: Number of the tick (period of the control loop).
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the epoch.
-        site: Row of the site, in which the torque is written.
+        site: Row of the site, to which the torque is written.
         links: Rows of the site's links.
-        chain: Rows of the chain of joints, or None for the planar arm. Its model is
-            in the row of the site already.
-        law: Row with the gains and memory of the law; changed.
-        received: Rows with the values that the peers' laws sent.
-        sent: Row with the values that this law sends; written.
+        chain: Rows of the chain of joints, or None for the planar arm. The row of the site
+            already contains the chain's model.
+        law: Row with the gains and memory of the law; updated in place.
+        received: Rows with the values sent by the peers' laws.
+        sent: Row with the values sent by this law; updated in place.
 
     Raises:
         FloatingPointError: A result is not finite.
@@ -258,8 +256,8 @@ def _compute_nothing(
 def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     """Returns the version of `compute_law` that calls the control law of a site.
 
-    The compiler calls this function with the types of the arguments, the first of which names
-    the law.
+    The compiler calls this function with the argument types, the first of which identifies the
+    law.
     """
     code = argument_types[0]
     if code.law_name == NO_LAW:
@@ -287,8 +285,8 @@ def _choose_law(argument_types: tuple[Any, ...]) -> Callable[..., None]:
     ) -> None:
         """Calls the control law of this site, with the arguments of `compute_law`.
 
-        The type of the first argument selects the law when the code is compiled. The argument
-        itself has no value.
+        The law is selected at compile time by the type of the first argument, which has no
+        value of its own.
         """
         s = site[0]
         if s.mode == _DIVERGED:

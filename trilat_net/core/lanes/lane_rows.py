@@ -1,21 +1,21 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Stores the states of several runs side by side, so that loops use vector instructions.
+"""Stores the states of several runs side by side, for loops with vector instructions.
 
-The state of an arm in one run is a row of numbers (`row_fields`). In lanes, each number becomes
-`LANES` numbers that are adjacent in memory, one for each run. For example, the first joint
-angles of all runs follow each other, so one instruction loads several of them. The position of
-a run among the others is called its lane.
+The state of an arm in one run is a row of values (`row_fields`). In lanes, each of them becomes
+`LANES` values that are adjacent in memory, one per run. The first joint angles of all runs, for
+example, are stored next to each other, so one instruction loads several of them. The position
+of a run among the others is called its lane.
 
-The functions of a control period get an object that represents the row of one lane and has the
-same fields as the row of a single run. Therefore no function needs a second version.
+The functions of a control period receive an object that represents the row of one lane, and has
+the same fields as the row of a single run. No function therefore needs a second version.
 
-Fields that are equal in all lanes, such as the kind of control law, can be constants. The
+Fields that are equal in all lanes, such as the type of control law, can be constants. The
 compiler then removes the branches for other values.
 
 Invariant:
-    - A row in a lane has the fields, shapes and types of a row of one run.
-    - All properties on which compiled code depends are in the name of a type, which is a part
+    - A row in a lane has the same fields, shapes and types as a row of a single run.
+    - Every property on which compiled code depends is part of a type name. These names are part
       of the key under which the code is stored.
 """
 
@@ -39,13 +39,13 @@ from numba.np import arrayobj
 from numpy.typing import NDArray
 
 LANES = 64
-"""Number of lanes, the largest number of runs that are computed together.
+"""Number of lanes, which is the largest number of runs that are computed together.
 
-A vector register holds at most eight numbers. With several registers per quantity, the
-processor computes one while it waits for the others.
+A vector register holds at most eight values. With several registers per quantity, the processor
+can compute one while waiting for the others.
 """
 _WORD = 8
-"""Size of each number of a row, bytes."""
+"""Size of each value in a row, bytes."""
 _ALIGNMENT = 64
 """Size of a vector register and of a cache line, bytes."""
 _NUMBA_KINDS = {"i8": types.int64, "f8": types.float64, "u8": types.uint64}
@@ -57,15 +57,15 @@ Constants = tuple[tuple[str, int], ...]
 
 
 class LaneField(NamedTuple):
-    """One field of a row, the state of one arm in one run, with its position in the row.
+    """One field of a row (the state of one arm in one run), with its position in the row.
 
-    All values per row have eight bytes.
+    All values in a row are eight bytes long.
 
     Attributes:
         name: Name of the field.
-        kind: Kind of its numbers: "i8", "f8" or "u8".
-        first_word: Index of its first number in a row of one run.
-        shape: Shape of the field in a row of one run, () for a single number.
+        kind: Element type: "i8", "f8" or "u8".
+        first_word: Index of its first value in a row of a single run.
+        shape: Shape of the field in a row of a single run, or () for a scalar.
     """
 
     name: str
@@ -75,14 +75,14 @@ class LaneField(NamedTuple):
 
 
 class LaneTable(types.Type):
-    """Numba's type of an array with the states of an arm in several runs side by side.
+    """Numba type of an array with the states of an arm in several runs side by side.
 
-    The state in one run is a row of numbers with named fields. Each run has a lane: a number of
-    the row becomes `LANES` adjacent numbers, one per run. A value of this type is a pointer to
-    the first number of the array.
+    The state in one run is a row of values with named fields. Each run has a lane: a value of
+    the row becomes `LANES` adjacent values, one per run. In machine code, an instance of this
+    type is a pointer to the first value of the array.
 
     Args:
-        dtype: Data type of a row of one run. All its numbers have 64 bits.
+        dtype: Data type of a row of a single run, whose values must all have 64 bits.
         constants: For each row, the fields that are equal in all lanes.
     """
 
@@ -101,25 +101,25 @@ class LaneTable(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs.
+        """Form of this type that Numba uses in the names of compiled functions.
 
-        The full name of the type has characters that such a name must not contain.
+        The full name of the type contains characters that are not allowed there.
         """
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return type(self).__name__, (f"l{digest[:16]}",)
 
     @property
     def count(self) -> int:
-        """Number of records with constant fields of their own, which the compiler knows.
+        """Number of records that have their own constant fields, known to the compiler.
 
         A field is constant if it is the same in all simulated runs (lanes), for example the
-        kind of a network link.
+        type of a network link.
         """
         return len(self.constants)
 
 
 class _PartOfTable(LaneTable):
-    """Numba's type of some rows of a `LaneTable` in one lane."""
+    """Numba type of some rows of a `LaneTable` in one lane."""
 
     def __init__(self, table: LaneTable, constants: tuple[Constants, ...]) -> None:
         self.fields = table.fields
@@ -129,7 +129,7 @@ class _PartOfTable(LaneTable):
 
 
 class RowType(types.Type):
-    """Base of the Numba types of a record in lanes, which look up its fields by their names.
+    """Base class of the Numba types of a record in lanes, which look up fields by name.
 
     Attributes:
         fields: Fields of the record.
@@ -140,17 +140,17 @@ class RowType(types.Type):
     constants: tuple[Constants, ...]
 
     def find_field(self, name: str) -> LaneField | None:
-        """Returns the position and type of a field of the record, such as "q", by its name.
+        """Looks up the position and type of a field of the record, such as "q".
 
         Returns None if the record has no such field.
         """
         return next((field for field in self.fields if field.name == name), None)
 
     def find_constant(self, name: str) -> int | None:
-        """Returns the value of a field that is the same in all runs, and known to the compiler.
+        """Returns the value of a field that is the same in all runs and known to the compiler.
 
         The compiler then inserts the value into the machine code, and removes branches that the
-        value excludes. Returns None if the field can differ between the runs.
+        value rules out. Returns None if the field can differ between runs.
         """
         return dict(self.constants[0]).get(name)
 
@@ -158,25 +158,25 @@ class RowType(types.Type):
 class RowsInLane(_PartOfTable):
     """Numba type of an array of records of one simulation, for example of all links of a site.
 
-    Several runs are simulated side by side (each in one lane). The same numbers of all runs are
-    adjacent in memory, and this type selects those of a single run.
+    Several runs are simulated side by side, with one run per lane. The same value of all runs
+    is adjacent in memory, and this type selects those of a single run.
     """
 
 
 class LaneRow(RowType, _PartOfTable):
     """Numba type of one record of one simulation, whose fields compiled code reads by name.
 
-    Several runs are simulated side by side (each in one lane), with the same numbers of all
-    runs adjacent in memory. The type hides this arrangement, so that the same source code works
-    for a run that is simulated alone.
+    Several runs are simulated side by side, with the same value of all runs adjacent in memory.
+    This type hides that memory layout, so the same source code also works for a run that is
+    simulated alone.
     """
 
 
 class LaneNumbers(types.Type):
-    """Numba type of an array with one integer for each of several runs simulated side by side.
+    """Numba type of an array with one integer per run, for runs simulated side by side.
 
-    An example is the number of the present control period of each run. In machine code, a value
-    of this type is a pointer to the first integer.
+    An example is the current tick of each run. In machine code, a value of this type is a
+    pointer to the first integer.
     """
 
     in_lanes = True
@@ -186,14 +186,14 @@ class LaneNumbers(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         return "LaneNumbers", (f"n{LANES}",)
 
 
 @register_model(LaneNumbers)
 @register_model(LaneTable)
 class _TableModel(models.PrimitiveModel):
-    """Represents a `LaneTable` in machine code by a pointer."""
+    """Represents a `LaneTable` in machine code as a pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -202,7 +202,7 @@ class _TableModel(models.PrimitiveModel):
 @register_model(RowsInLane)
 @register_model(LaneRow)
 class _RowModel(models.StructModel):
-    """Represents rows in a lane in machine code by a pointer and the lane's index."""
+    """Represents rows in a lane in machine code as a pointer and the index of the lane."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         members = [("pointer", types.voidptr), ("lane", types.intp)]
@@ -210,20 +210,20 @@ class _RowModel(models.StructModel):
 
 
 def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
-    """Generates LLVM code for an address that is a number of bytes after a pointer."""
+    """Generates LLVM code that adds a byte offset to a pointer."""
     return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
 
 
 def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
     """Generates LLVM code for the address a given number of words after a pointer.
 
-    The rows of several runs are stored side by side, so that each number of a row occupies
-    `LANES` numbers in memory.
+    The rows of several runs are stored side by side, so each value of a row occupies `LANES`
+    values in memory.
 
     Args:
-        builder: Appends LLVM instructions.
+        builder: Builder that appends LLVM instructions.
         pointer: The pointer.
-        word_count: Distance in 64-bit words of a row of one run.
+        word_count: Distance in 64-bit words of a row of a single run.
     """
     word = ir.IntType(64)
     return _offset_pointer(builder, pointer, ir.Constant(word, word_count * LANES * _WORD))
@@ -258,7 +258,7 @@ class _RowsAttributes(AttributeTemplate):
 def _find_number(
     context: Any, builder: Any, row_type: LaneRow, row_value: Any, field: LaneField
 ) -> Any:
-    """Generates LLVM code for the address of a field's first number in a lane."""
+    """Generates LLVM code for the address of a field's first value in a lane."""
     row = cgutils.create_struct_proxy(row_type)(context, builder, value=row_value)
     word = row.lane.type
     in_lane = builder.mul(row.lane, ir.Constant(word, _WORD))
@@ -276,17 +276,17 @@ def make_view(
     shape: tuple[int, ...],
     itemsize: int,
 ) -> Any:
-    """Generates LLVM code for an array that shows a field of a row in one lane, or in several.
+    """Generates LLVM code for an array that views a row's field in one lane, or in several.
 
-    Successive elements of the field are `LANES` numbers apart in memory.
+    Successive elements of the field are `LANES` values apart in memory.
 
     Args:
-        context: Numba's context of the compilation.
-        builder: Appends LLVM instructions.
-        array_type: Numba's type of the array.
+        context: Numba's compilation context.
+        builder: Builder that appends LLVM instructions.
+        array_type: Numba type of the array.
         data: Pointer to the first element, as an LLVM value.
         shape: Shape of the field.
-        itemsize: Size of an element of the array, bytes.
+        itemsize: Size of an array element, bytes.
     """
     strides: list[int] = []
     step = LANES * _WORD
@@ -315,14 +315,14 @@ def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: s
     """Generates LLVM code that reads a field of a record of one simulation, as `row.field`.
 
     Numba calls this function when it compiles such an expression. Several runs are simulated
-    side by side, each in one lane. The result is a constant if the field is equal in all lanes,
-    a number if the field is a single number, and otherwise an array whose numbers are `LANES`
-    numbers apart in memory.
+    side by side, with one run per lane. The result is a constant if the field is equal in all
+    lanes, otherwise a scalar for a scalar field, and an array for any other field. The elements
+    of this array are `LANES` values apart in memory.
 
     Args:
-        context: Numba's context of the compilation.
-        builder: Appends LLVM instructions.
-        row_type: Numba's type of the row.
+        context: Numba's compilation context.
+        builder: Builder that appends LLVM instructions.
+        row_type: Numba type of the row.
         row: The row, as an LLVM value.
         name: Name of the field.
     """
@@ -341,7 +341,7 @@ def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: s
 
 @lower_setattr_generic(LaneRow)
 def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Generates LLVM code for writing a number to `row.field`."""
+    """Generates LLVM code that writes a value to `row.field`."""
     row_type, value_type = sig.args
     row, value = args
     field = row_type.find_field(name)
@@ -368,12 +368,12 @@ def _find_row(
     """Generates LLVM code for `rows[index]`: one record of one of several simulations.
 
     Args:
-        context: Numba's context of the compilation.
-        builder: Appends LLVM instructions.
-        rows_type: Numba's type of the rows.
+        context: Numba's compilation context.
+        builder: Builder that appends LLVM instructions.
+        rows_type: Numba type of the rows.
         rows_value: The rows, as an LLVM value.
         index: The index, as an LLVM value.
-        row_type: Numba's type of the row.
+        row_type: Numba type of the row.
     """
     rows = cgutils.create_struct_proxy(rows_type)(context, builder, value=rows_value)
     row = cgutils.create_struct_proxy(row_type)(context, builder)
@@ -385,7 +385,7 @@ def _find_row(
 
 @infer_global(operator.getitem)
 class _RowsItem(AbstractTemplate):
-    """Tells Numba the type of `rows[index]`, if all rows have the same constants."""
+    """Tells Numba the type of `rows[index]` if all rows have the same constants."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         rows, index = args
@@ -436,7 +436,7 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
     """Generates LLVM code for `rows[index]` with a constant index.
 
     With a constant index, the compiler knows the constant fields of this record (row), such as
-    the kind of an operator, and can remove the branches for other kinds.
+    the type of an operator, and can remove the branches for other types.
     """
     if not isinstance(index, types.IntegerLiteral):
         return None
@@ -452,10 +452,10 @@ def _select_row(_context: Any, rows: Any, index: Any) -> Any:
 
 @intrinsic
 def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
-    """Generates LLVM code for an integer of one lane, such as its present tick.
+    """Generates LLVM code for an integer of one lane, such as its current tick.
 
-    The first argument is an array with one integer per lane, or a single integer that is equal
-    in all lanes.
+    The first argument is either an array with one integer per lane, or a single integer shared
+    by all lanes.
     """
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -474,7 +474,7 @@ def _number_of(_context: Any, numbers: Any, _lane: Any) -> Any:
 
 @intrinsic
 def _pointer_to(_context: Any, address: Any) -> Any:
-    """Generates LLVM code for the conversion of an address to a pointer."""
+    """Generates LLVM code that converts an address to a pointer."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
@@ -486,24 +486,26 @@ def _pointer_to(_context: Any, address: Any) -> Any:
 in_lane: Any = _in_lane
 """Returns the rows of a table in one lane: `in_lane(table, lane)`."""
 select_row: Any = _select_row
-"""Returns a row with its own constants: `select_row(rows, index)`. The index is a constant."""
+"""Returns a row with its own constants: `select_row(rows, index)`, for a constant index."""
 number_of: Any = _number_of
-"""Returns the integer of a lane: `number_of(numbers, lane)`. The numbers are `LaneNumbers`, an
-array with one entry per lane, or one integer that all lanes share.
+"""Returns the integer of a lane: `number_of(numbers, lane)`.
+
+`numbers` is either a `LaneNumbers` array with one entry per lane, or an integer shared by all
+lanes.
 """
 pointer_to: Any = _pointer_to
 """Converts the address of a table to a pointer, which represents the table in calls."""
 
 
 def allocate_words(rows: int, row_length: int) -> Words:
-    """Returns an array of zeros for the states of several runs side by side.
+    """Allocates a zero-filled array for the states of several runs side by side.
 
-    The shape is (rows, values per row, LANES), and each run has one of the lanes. The array
-    is aligned to a cache line, because vector instructions read an aligned array faster.
+    The shape is (rows, values per row, LANES), with one lane per run. The array is aligned to a
+    cache line, because vector instructions read an aligned array faster.
 
     Args:
         rows: Number of rows.
-        row_length: Number of values in a row of one run.
+        row_length: Number of values in a row of a single run.
     """
     count = rows * row_length * LANES
     room = np.zeros(count + _ALIGNMENT // _WORD, np.int64)
@@ -514,7 +516,7 @@ def allocate_words(rows: int, row_length: int) -> Words:
 def read_words(rows: NDArray[Any]) -> Words:
     """Returns the values of structured records as integers with the same bits ("words").
 
-    The same code can then copy values of all types. The shape is (rows, words per row).
+    The same code can then copy values of any type. The shape is (rows, words per row).
 
     Args:
         rows: Structured array of the rows, shape (rows,).

@@ -1,12 +1,13 @@
 """Simulates up to `LANES` runs together, each in one lane of the vector registers.
 
 `LaneRun` takes runs with equal structure, for example the points of a sweep over a gain, and
-advances them to a time. It is the counterpart of `CompiledRun`, which simulates one run.
+advances them to a given time. It is the counterpart of `CompiledRun`, which simulates a single
+run.
 
 Invariant:
-    - After `advance_to`, each run has the numbers that `CompiledRun.advance_to` would give it,
-      bit for bit. Only intermediate results of a tick ("scratch" in `row_fields`), and obsolete
-      entries of ring buffers, may differ.
+    - After `advance_to`, each run is bit-identical to what `CompiledRun.advance_to` would have
+      produced. Only intermediate results of a tick ("scratch" in `row_fields`) and obsolete
+      entries of ring buffers may differ.
     - The arrays of the lanes do not overlap in memory, as `advance_site` requires.
 """
 
@@ -45,33 +46,32 @@ from .lane_structure import RunStructure, SiteStructure
 _FIRST_PAGES = 256
 """Initial number of ticks whose states are kept, a power of two."""
 _REFERENCE_FIELDS = ("alpha", "alpha_rate", "gone")
-"""Fields of a link's row that stage 3 of a tick writes."""
+"""Fields of a link's row that are written in stage 3 of a tick."""
 _STATE_FIELDS = ("q", "qd", "tau_x")
 """Fields of a link's row that contain the sample in use."""
 
 
 class _SiteTables(NamedTuple):
-    """The state of one site (simulated arm with its controller) in several runs side by side.
+    """The state of one site in several runs side by side.
 
-    Each run has a lane, an element of the vector registers. In each array, the numbers of all
-    lanes are adjacent. The compiled function `advance_site` receives these arrays. A row is a
-    record with named fields, see `row_fields`.
+    Each run has a lane (an element of the vector registers). In each array, the values of all
+    lanes are adjacent. The arrays are passed to the compiled function `advance_site`. A row is
+    a record with named fields, see `row_fields`.
 
     Attributes:
         site: Row with the state of the site.
         links: Rows of the links from other sites.
         actors: Rows of the operators and environments that act on the arm.
-        environments: The rows of the environments alone.
-        ramps: Row with the planned changes of the dominance factors (how strongly the site
-            follows each other site).
-        record: Row with the results of a tick (control period), which a log would contain.
-        peaks: Largest values, one row per interval of 50 ms (bucket).
+        environments: Rows of the environments only.
+        ramps: Row of planned changes of the dominance factors.
+        record: Row with the results of a tick, as they would be logged.
+        peaks: Largest values, one row per 50 ms interval (bucket).
         sums: Row with sums over the run.
         progress: Row with the progress of the run.
         scratch: Row with intermediate results of the integrator.
         law: Row with the gains and memory of a compiled control law.
-        received: Rows with the values that the laws of other sites sent.
-        sent: Row with the values that this law sends.
+        received: Rows with the values sent by the laws of other sites.
+        sent: Row with the values sent by this law.
         code: Tells the compiler which law to call. The array itself is not used.
         chain: Rows of the joints, if the arm is a chain.
     """
@@ -94,23 +94,23 @@ class _SiteTables(NamedTuple):
 
 
 class _LaneLayout(NamedTuple):
-    """Data types and lengths of the arrays of a run, which its compiled code must know.
+    """Data types and lengths of a run's arrays, on which its compiled code depends.
 
     Runs with equal layouts can use the same code.
 
     Attributes:
-        site: Data type of the state of a site, the simulated arm with its controller.
-        link: Data type of the state of a link between two sites.
+        site: Data type of the state of a site.
+        link: Data type of the state of a link.
         actor: Data type of an operator or environment.
-        sums: Data type of the sums over the run of a site.
+        sums: Data type of the sums over a site's run.
         progress: Data type of the progress of a site.
-        floats: Number of floats in a record, the result of one tick (control period).
-        columns: Number of columns of the array of largest values (peaks).
+        floats: Number of floats in a record.
+        columns: Number of columns in the array of largest values (peaks).
         ramps: Shape of the table of dominance factors.
         chain: Data type of a joint. None for planar arms.
         joints: Number of joints whose angles the sites exchange.
         law: Largest number of gains and memory values of a compiled control law.
-        received: Largest number of values that a law receives from another site (peer).
+        received: Largest number of values that a law receives from a peer.
         sent: Largest number of values that a law sends.
     """
 
@@ -132,7 +132,7 @@ class _LaneLayout(NamedTuple):
 def _find_layout(run: CompiledRun) -> _LaneLayout:
     """Returns the data types and lengths of all arrays of a run, on which its code depends.
 
-    Without compiled control laws, the arrays for laws have the length 0.
+    Without compiled control laws, the arrays for laws have length 0.
     """
     memory = run.memory
     tables = memory.tables
@@ -162,20 +162,20 @@ def _list_argument_types(
     """Returns the Numba types for which the code of one control period is compiled.
 
     The types contain everything that the compiled code depends on: the layouts of the arrays,
-    and properties that are equal in all simulated runs, such as the kinds of the operators.
+    and properties that are equal in all runs, such as the types of the operators.
 
     Args:
         layout: Data types and lengths of the arrays.
         structure: Structure of the run.
         site: Structure of the site.
         clock: Type of the tick and of its nominal time: an integer if they are equal in all
-            lanes, else `LaneNumbers`.
+            lanes, otherwise `LaneNumbers`.
     """
     first = site.first_environment
     actors = site.actors
     chain = _type_numbers(0, 1)
     if layout.chain is not None:
-        # The actors and the joints of a chain are selected by the variable of a loop.
+        # The actors and joints of a chain are selected by a loop variable.
         actors = ((),) * len(actors)
         constants = () if any(site.prismatic) else (("prismatic", 0),)
         chain = LaneTable(layout.chain, (constants,) * len(site.prismatic))
@@ -207,9 +207,9 @@ def _list_argument_types(
 
 
 def _type_numbers(count: int, rows: int) -> LaneTable:
-    """Returns the Numba type of a table in which every row is a vector of numbers.
+    """Returns the Numba type of a table in which every row is a vector of floats.
 
-    Compiled code addresses this vector as the field `numbers` of a row.
+    Compiled code accesses this vector as the field `numbers` of a row.
 
     Args:
         count: Number of values in each row.
@@ -219,24 +219,24 @@ def _type_numbers(count: int, rows: int) -> LaneTable:
 
 
 def _choose_code(layout: _LaneLayout) -> Callable[..., None]:
-    """Returns the compiled function that advances several simulated runs by one control period.
+    """Returns the compiled function that advances several runs by one control period.
 
-    There is one function for planar arms with two joints, and one for chains of joints from a
-    URDF file. The layout of the arrays decides which one is returned.
+    Depending on the layout of the arrays, this is the function for planar arms with two joints,
+    or the one for chains of joints from a URDF file.
     """
     return advance_site if layout.chain is None else advance_chain_site
 
 
 def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type) -> IntArray:
-    """Returns the address of the compiled code that computes a tick of each site.
+    """Returns the address of the compiled code that computes a tick, for each site.
 
-    The code computes a tick (period of the control loop) for several runs at once. It is
-    compiled if it is not stored on disk yet.
+    The code computes a tick for several runs at once. It is compiled if it is not yet stored on
+    disk.
 
     Args:
         run: One of the runs.
-        structure: The structure that all these runs have, see `RunStructure`.
-        clock: Numba's type of the ticks, see `_list_argument_types`.
+        structure: The structure shared by all of these runs, see `RunStructure`.
+        clock: Numba type of the ticks, see `_list_argument_types`.
 
     Raises:
         NumbaError: A user's law cannot be compiled for several runs at once.
@@ -250,18 +250,17 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
 
 
 def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> str:
-    """Returns why a control law cannot be compiled for several runs at once, for a message.
+    """Explains to the user why a control law cannot be compiled for several runs at once.
 
-    Such a law may still be compiled for a single run. The function finds the answer by
-    compiling the code.
+    Such a law may still be compilable for a single run. This compiles the code to find out.
 
     Args:
-        run: The run before its first tick (control period). `find_obstacle` must find no reason
-            against computing it in a lane.
+        run: The run before its first tick. `find_obstacle` must have found no obstacle to
+            computing it in a lane.
         clock: Type of the ticks, see `_list_argument_types`.
 
     Returns:
-        The reason. Empty if all laws can be compiled.
+        The reason, or an empty string if all laws can be compiled.
     """
     try:
         _find_addresses(run, RunStructure.find(run), clock)
@@ -271,10 +270,9 @@ def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> s
 
 
 def read_assembly(run: CompiledRun, i: int) -> str:
-    """Returns the machine code for one arm as text, for tests.
+    """Returns the assembly code for one arm, for tests.
 
-    The tests check that it contains vector instructions, because the simulation is slow without
-    them.
+    The tests check that it contains vector instructions, without which the simulation is slow.
 
     Args:
         run: The run.
@@ -288,15 +286,15 @@ def read_assembly(run: CompiledRun, i: int) -> str:
 
 @leaf
 def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
-    """Copies the results of several simulations from common arrays to one array per run.
+    """Copies the results of several simulations from shared arrays to one array per run.
 
     Args:
         first: First tick of each site, shape (N,).
         kept: Latest records of all sites, shape (N, rows, floats, LANES). The record of tick k
             is in row k modulo the number of rows.
-        records: Receives the results, shape (runs, N, ticks, floats).
+        records: Output array for the results, shape (runs, N, ticks, floats).
     """
-    # The numbers of all lanes in a record are in few cache lines.
+    # The values of all lanes in a record occupy only a few cache lines.
     for i in range(records.shape[1]):
         for tick in range(records.shape[2]):
             row = (first[i] + tick) & (kept.shape[1] - 1)
@@ -308,11 +306,10 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
 def has_lane_code(run: CompiledRun) -> bool:
     """Returns True if the code that simulates a run in lanes is already stored on disk.
 
-    A lane is the position of one of several runs that are simulated at once. Without stored
-    code, the compilation takes some time before the runs can start.
+    Without stored code, the runs can only start after a compilation that takes some time.
 
     Args:
-        run: The run. `find_obstacle` must find no reason against computing it in a lane.
+        run: The run. `find_obstacle` must have found no obstacle to computing it in a lane.
     """
     structure = RunStructure.find(run)
     layout = _find_layout(run)
@@ -325,14 +322,14 @@ def has_lane_code(run: CompiledRun) -> bool:
 
 
 class _LinksOfRun:
-    """Updates the simulated network links of a run, but only if this is needed.
+    """Brings the simulated network links of a run up to date, but only when necessary.
 
     While several runs are simulated together, their deliveries are computed in another way,
-    which does not update the state of the links. Only a run that then continues alone needs
-    this state.
+    which does not update the link state. This state is only needed by a run that then continues
+    on its own.
 
     Args:
-        run: The run before its first tick (control period).
+        run: The run before its first tick.
     """
 
     def __init__(self, run: CompiledRun) -> None:
@@ -348,8 +345,8 @@ class _LinksOfRun:
 
         Args:
             ticks: Number of ticks that each site has executed.
-            links: Rows of its links after these ticks. Only fields of the sample in use, and
-                fields that stage 3 of a tick writes, are up to date.
+            links: Rows of its links after these ticks. Only the fields of the sample in use,
+                and those written in stage 3 of a tick, are up to date.
             states: The latest states of its sites, see `repeat_deliveries`.
             received: Values from laws that arrived with the samples in use, shape (N P, C).
         """
@@ -357,7 +354,7 @@ class _LinksOfRun:
         self._run.pending_deliveries = partial(self._update, links, states, received)
 
     def _update(self, links: NDArray[Any], states: Array, received: Array) -> None:
-        """Computes the state of the links up to the ticks that `set_pending` stored."""
+        """Computes the link state up to the ticks stored by `set_pending`."""
         memory = self._run.memory
         tables = memory.tables
         for ticks in self._ends:
@@ -384,13 +381,13 @@ class _LinksOfRun:
 
 
 def _pack_tables(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
-    """Stores arrays of several runs side by side, as vector instructions require.
+    """Interleaves the arrays of several runs, as vector instructions require.
 
     Args:
-        tables_of_runs: The same array of each run.
+        tables_of_runs: The same array from each run.
 
     Returns:
-        The numbers of all runs, shape (rows, values per row, LANES).
+        The values of all runs, shape (rows, values per row, LANES).
     """
     tables_of_lanes = [read_words(table.reshape(-1)) for table in tables_of_runs]
     rows, row_length = tables_of_lanes[0].shape
@@ -405,17 +402,16 @@ def _pack_tables(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
 class LaneRun:
     """Simulates several runs of equal structure together with vector instructions.
 
-    Each run has a lane, an element of the vector registers, so that one instruction computes
-    the same number of several runs.
+    Each run occupies a lane (an element of the vector registers), so that one instruction
+    computes the same quantity for several runs.
 
     Args:
-        runs: The runs before their first tick (control period), at most `LANES`. They must have
-            the same structure, see `RunStructure`, and no obstacle, see `find_obstacle`.
-        record_rows: Number of latest records of each site (arm controller) that are kept, a
-            power of two.
+        runs: The runs before their first tick, at most `LANES`. They must have the same
+            structure, see `RunStructure`, and no obstacle, see `find_obstacle`.
+        record_rows: Number of latest records kept per site, a power of two.
 
     Attributes:
-        runs: The runs that are in the lanes. `advance_to` writes the results into them.
+        runs: The runs in the lanes. `advance_to` writes the results to them.
         clock: Type of the ticks, see `_list_argument_types`.
     """
 
@@ -479,7 +475,7 @@ class LaneRun:
         self._hands = _find_recorded_hands(memories[0].feed, layout.actor, most_sources)
 
     def _allocate_ended(self) -> EndedRuns:
-        """Allocates memory for the last states of the runs, none of which has ended yet."""
+        """Allocates memory for the final states of the runs, none of which has ended yet."""
         return EndedRuns(
             ticks=np.full(LANES, -1),
             site_ticks=np.zeros((self._sites, LANES), np.int64),
@@ -494,11 +490,9 @@ class LaneRun:
         )
 
     def _put_first_states(self, lane: int, arrays: SiteArrays) -> None:
-        """Copies the initial state of each site, as the other sites know it, into a lane.
+        """Copies the initial state of each site, as known to the other sites, into a lane.
 
-        A site (arm controller) uses these initial states of its peers (the other sites) until
-        the first sample has arrived. The lane is the position of the run among the runs that
-        are simulated together.
+        A site uses these initial states of its peers until the first sample has arrived.
 
         Args:
             lane: Index of the lane.
@@ -516,8 +510,6 @@ class LaneRun:
     def _put_laws(self, memories: Sequence[RunMemory]) -> None:
         """Copies the gains and memory of compiled control laws into the arrays of all lanes.
 
-        A lane is the position of one run among the runs that are simulated together.
-
         Args:
             memories: Arrays of each run.
         """
@@ -534,8 +526,7 @@ class LaneRun:
     def _find_tables(self) -> IntArray:
         """Returns the memory address of each array of each of the N sites, shape (N, 15).
 
-        The compiled code of a tick (control period) receives the addresses of these 15 arrays
-        (`_SiteTables`).
+        The compiled code of a tick receives the addresses of these 15 arrays (`_SiteTables`).
         """
         structure = self._structure
         addresses = []
@@ -564,14 +555,13 @@ class LaneRun:
         return np.array(addresses, dtype=np.int64)
 
     def advance_to(self, until_s: float) -> None:
-        """Continues all runs until they are as long as a run with a duration of `until_s` s.
+        """Continues all runs to the end of a run with a duration of `until_s` seconds.
 
-        A run ends earlier if an arm leaves its limits. The results, and the records (results of
-        control periods) of the latest ticks (control periods) if they are kept, are written
-        into the `CompiledRun` objects.
+        A run ends earlier if an arm leaves its limits. The results are written to the
+        `CompiledRun` objects, together with the latest records if these are kept.
 
         Args:
-            until_s: The time, s, later than that of the previous call.
+            until_s: The time, s, later than in the previous call.
         """
         lanes = [lane for lane in range(len(self.runs)) if self._ended.ticks[lane] < 0]
         if not lanes:
@@ -596,10 +586,9 @@ class LaneRun:
             self._write_back(lane, self.runs[lane], until_s)
 
     def _use_samples(self, end: IntArray) -> int:
-        """Finds the peers' states that each site uses in a block of control periods.
+        """Finds which samples from its peers each site uses in a block of control periods.
 
-        They depend on the delays of the network. A site is the controller of one arm, a peer is
-        another site, and a tick is a control period; see `use_samples`.
+        This depends on the network delays; see `use_samples`.
 
         Args:
             end: Tick of each site after the block, shape (N,).
@@ -630,10 +619,10 @@ class LaneRun:
         )
 
     def _find_block_end(self, ticks: IntArray) -> IntArray:
-        """Returns the control period (tick) of each site at the end of the next block.
+        """Returns the tick of each site at the end of the next block.
 
-        The sites (controllers of one arm each) may have different rates. A block is an interval
-        of time that all sites simulate before samples are exchanged.
+        Sites may have different rates. A block is a time interval that all sites simulate
+        before samples are exchanged.
 
         Args:
             ticks: Number of ticks of each site after all blocks.
@@ -650,7 +639,7 @@ class LaneRun:
         return np.clip(end, self._ticks, ticks)
 
     def _step_to(self, ticks: IntArray) -> None:
-        """Continues all simulations up to a number of control periods, or until all have ended.
+        """Continues all runs up to a given number of ticks, or until all have ended.
 
         Args:
             ticks: Number of ticks of each site since the start of the runs, shape (N,).
@@ -689,7 +678,7 @@ class LaneRun:
             )
 
     def _list_present(self) -> EndedRuns:
-        """Returns the present state of all simulated runs, as views that share their memory.
+        """Returns the current state of all runs, as views that share their memory.
 
         When a run ends early, `keep_ended_runs` copies its state from these views, because the
         arrays are overwritten while the other runs continue.
@@ -708,15 +697,14 @@ class LaneRun:
         )
 
     def _keep_states(self, ticks: int) -> None:
-        """Enlarges the memory for past states of the sites (arm controllers), if necessary.
+        """Enlarges the memory for past states of the sites, if necessary.
 
-        A site uses a past state (sample) of another site, because the network delays samples.
-        Samples that are older than the sample in use are never used again. Therefore far fewer
-        states are needed than the longest delay of a link would require.
+        A site uses past states (samples) of other sites, because the network delays them.
+        Samples older than the one in use are never used again, so far fewer states are needed
+        than the longest delay of a link would suggest.
 
         Args:
-            ticks: Number of ticks (control periods) before the present tick for which the
-                states are needed.
+            ticks: Number of ticks before the current tick for which the states are needed.
         """
         while self._pages <= ticks:
             old_pages = self._pages
@@ -729,13 +717,13 @@ class LaneRun:
             self._states = states
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Continues with some of the runs only, so that no time is spent on the others.
+        """Drops all runs except the given ones.
 
-        A search, for example, drops runs that can no longer be the best.
+        A search, for example, saves time by dropping runs that can no longer be the best.
 
         Args:
-            chosen: Indices in `runs` of the runs that continue, in ascending order. No run
-                among them may have ended.
+            chosen: Indices in `runs` of the runs that continue, in ascending order. None of
+                them may have ended.
         """
         assert all(self._ended.ticks[lane] < 0 for lane in chosen)
         lanes = list(chosen)
@@ -752,10 +740,10 @@ class LaneRun:
         self.runs = [self.runs[lane] for lane in lanes]
 
     def _widen_peaks(self, buckets: int) -> None:
-        """Enlarges the arrays that hold the largest values of each interval of 50 ms.
+        """Enlarges the arrays that hold the largest values of each 50 ms interval.
 
-        The arrays must have room for all intervals up to the end of the simulation. New entries
-        are -1, which marks an interval in which no control period has been executed.
+        They must cover all intervals up to the end of the simulation. New entries are -1, which
+        marks an interval in which no control period has been executed.
         """
         wider = allocate_words(self._sites * buckets, self._layout.columns)
         peaks = wider.reshape(self._sites, buckets, self._layout.columns, LANES)
@@ -766,14 +754,12 @@ class LaneRun:
     def _write_records(self, lane: int, run: CompiledRun, records: Array) -> None:
         """Copies the latest records of one lane into the object of its run.
 
-        A lane is the position of a run among the runs that are simulated together. The caller
-        reads the records from the run with `CompiledRun.pop_records`.
+        The caller reads them from there with `CompiledRun.pop_records`.
 
         Args:
             lane: Index of the lane.
             run: The run.
-            records: Records of all N sites (arm controllers) in the latest ticks (control
-                periods), shape (N, ticks, floats).
+            records: Records of all N sites in the latest ticks, shape (N, ticks, floats).
         """
         sent = run.memory.sent
         has_ended = self._ended.ticks[lane] >= 0
@@ -782,7 +768,7 @@ class LaneRun:
             first = int(self._ticks[i]) - records.shape[1]
             ticks = np.arange(max(first, end - sent.t_ns.shape[1], 0), end)
             pages = ticks % sent.t_ns.shape[1]
-            # The equation of `tick_ns`.
+            # Same equation as in `tick_ns`.
             sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
             sent.rows[i, pages] = records[i, ticks - first]
 
@@ -790,7 +776,7 @@ class LaneRun:
         """Copies the state of a run that was simulated with others into its `CompiledRun`.
 
         Args:
-            lane: Index (lane) of the run among the runs that are simulated together.
+            lane: Index of the lane.
             run: The object of the run.
             until_s: Planned end of the run, s.
         """
@@ -819,7 +805,7 @@ class LaneRun:
         rows = unsettled_ns.view(memory.progress.dtype).reshape(-1)
         memory.progress["unsettled_ns"] = rows["unsettled_ns"]
         _write_progress(memory.progress, ticks, self._rates_hz)
-        # The equation of `tick_ns`.
+        # Same equation as in `tick_ns`.
         last_ns = (ticks - 1) * NS_PER_S // self._rates_hz
         if has_ended:
             diverged = tables.site["mode"][:, 0] == Mode.DIVERGED
@@ -847,14 +833,13 @@ class LaneRun:
             )
 
     def _write_sent(self, lane: int, run: CompiledRun) -> None:
-        """Copies the latest sent states of one run from common arrays into its records.
+        """Copies the samples that one run sent last from shared arrays into its records.
 
-        Several runs are simulated side by side, each in one lane. A slow site (arm controller)
-        accepts several samples (sent states) of a faster peer at once. A run that continues
-        alone reads from its records the samples that no site has accepted yet.
+        A slow site accepts several samples from a faster peer at once. If the run continues on
+        its own, it reads from its records those samples that no site has accepted yet.
 
         Args:
-            lane: The lane.
+            lane: Index of the lane.
             run: The run.
         """
         sent = run.memory.sent
@@ -864,7 +849,7 @@ class LaneRun:
             end = int(self._ticks[i])
             ticks = np.arange(max(end - kept, 0), end)
             pages = ticks % sent.t_ns.shape[1]
-            # The equation of `tick_ns`.
+            # Same equation as in `tick_ns`.
             sent.t_ns[i, pages] = ticks * NS_PER_S // self._rates_hz[i]
             states = self._states[i, ticks % self._pages, lane]
             names = ("x", "xd", "wrench") if layout.task else ("q", "qd", "tau_x")
@@ -882,12 +867,12 @@ def _find_recorded_hands(
 ) -> RecordedHands:
     """Returns the torques or targets with which live operators moved arms in a recorded run.
 
-    A repetition of the run applies them again at the same control periods.
+    They are applied again at the same control periods when the run is repeated.
 
     Args:
         feed: Inputs of the recorded run.
-        actor: Data type of the row of an operator.
-        most_sources: Number of rows of operators and environments of each site.
+        actor: Data type of an operator's row.
+        most_sources: Number of rows of operators and environments per site.
     """
     coordinates = (feed.hands.shape[2] - 1) // 2
     hand_words = [*find_words(actor, "grip")]
@@ -904,17 +889,17 @@ def _find_recorded_hands(
 def view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
     """Returns an array of floats as structured records with named fields.
 
-    The array has the shape (N, rows, columns) for N sites. The records share its memory, so
-    that assigning to a field changes the array.
+    The array has shape (N, rows, columns) for N sites. The records share its memory, so
+    assigning to a field changes the array.
     """
     return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
 
 
 def _share(table: Words, i: int, sites: int) -> Words:
-    """Returns the rows of an array that belong to one site (controller of one arm).
+    """Returns the rows of an array that belong to one site.
 
-    The array contains the rows of all sites one after another, equally many for each site. For
-    example, site 1 of 3 has the rows 2 and 3 of 6.
+    The array contains the rows of all sites one after another, with the same number of rows per
+    site. For example, site 1 of 3 owns rows 2 and 3 of 6.
     """
     rows = len(table) // sites
     return table[i * rows : (i + 1) * rows]
@@ -929,10 +914,10 @@ def _check_distinct(tables: _SiteTables) -> None:
 
 
 def put_rows(rows: NDArray[Any], numbers: Words) -> None:
-    """Overwrites structured records with values given as integers with the same bits.
+    """Overwrites structured records with values given as 64-bit words, see `read_words`.
 
     Args:
-        rows: The rows; written.
+        rows: Rows to overwrite.
         numbers: The values, shape (rows, words per row).
     """
     new_rows = np.ascontiguousarray(numbers).view(rows.dtype)
@@ -940,12 +925,12 @@ def put_rows(rows: NDArray[Any], numbers: Words) -> None:
 
 
 def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
-    """Sets the number and time of the next control period (tick) of each site of a run.
+    """Sets the number and time of the next tick of each site of a run.
 
-    The time is "never" for a site that has executed all its control periods, see `ProgressRow`.
+    The time is "never" for a site that has executed all its ticks, see `ProgressRow`.
 
     Args:
-        progress: Rows of all sites, see `ProgressRow`; written.
+        progress: Rows of all sites, see `ProgressRow`; updated in place.
         ticks: Number of ticks of each site, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
     """
@@ -954,14 +939,14 @@ def _write_progress(progress: Any, ticks: IntArray, rates_hz: IntArray) -> None:
     progress["bucket"] = parts // rates_hz
     progress["part"] = parts % rates_hz
     has_finished = ticks >= progress["ticks"]
-    # The equation of `tick_ns`.
+    # Same equation as in `tick_ns`.
     progress["t_ns"] = np.where(has_finished, NEVER_NS, ticks * NS_PER_S // rates_hz)
 
 
 def find_words(layout: np.dtype[Any], name: str) -> range:
-    """Returns the positions of the numbers of a field, such as "q", in a record.
+    """Returns the positions of a field's values in a record, for example those of "q".
 
-    The positions are indices among all numbers of the record (row).
+    The positions are indices among all values of the record (row).
 
     Args:
         layout: Data type of the row.

@@ -1,13 +1,13 @@
 """Computes one control period of an arm for several runs at once.
 
-Each run has a lane, a position in the vector registers of the processor. Each stage of the
-period, for example the torque of the control law, is a loop over the lanes that calls the
-function of the kernel for one run. The stages have loops of their own, so that the compiler
-turns each loop into vector instructions.
+Each run has a lane (a position in the processor's vector registers). Each stage of the period,
+for example the torque of the control law, is a loop over the lanes that calls the kernel
+function for one run. Stages have separate loops, because the compiler can then vectorise each
+of them.
 
 Invariant:
     - No equation of a control period is repeated here.
-    - The numbers of a lane do not depend on the other lanes.
+    - The results of a lane do not depend on the other lanes.
 """
 
 from collections.abc import Callable
@@ -66,16 +66,16 @@ def _no_torque(
     _table: TorqueTable,
     _sampled: int,
 ) -> SourceTorque:
-    """Returns no torque: `torque_on_arm` of an arm without operators and environments."""
+    """Returns zero torque: `torque_on_arm` of an arm without operators and environments."""
     return NO_TORQUE
 
 
 def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
     """Returns a function that adds the torques of a fixed number of operators and environments.
 
-    It replaces the loop in `torque_on_arm`. The compiler knows the kind of each operator and
-    environment only if its index is a constant and not the variable of a loop. Therefore the
-    loop is unrolled: the function for n torque sources calls the function for n - 1 torque
+    It replaces the loop in `torque_on_arm`. The compiler knows the type of each operator and
+    environment only if its index is a constant instead of a loop variable. The loop is
+    therefore unrolled: the function for n torque sources calls the function for n - 1 torque
     sources.
 
     Args:
@@ -105,7 +105,7 @@ def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
 def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]:
     """Returns the version of `torque_on_arm` for the number of operators and environments.
 
-    The compiler calls this function with the types of the arguments.
+    The compiler calls this function with the argument types.
     """
     actors = argument_types[4]
     return _unroll_sources(actors.count)
@@ -126,16 +126,16 @@ def _advance_stage(
 ) -> Any:
     """Evaluates one stage of the Runge-Kutta step of a planar arm in one of several runs.
 
-    The function calls `two_link_stages.advance_stage` with the numbers of the run.
+    Calls `two_link_stages.advance_stage` with the values of the run.
 
     Args:
-        t_s: Time at the beginning of the period, s.
-        ahead_s: Time of the stage after the beginning of the period, s.
-        s: State of the site, the arm with its controller.
+        t_s: Time at the start of the period, s.
+        ahead_s: Time of the stage after the start of the period, s.
+        s: State of the site.
         qd_before: Joint velocities at the previous stage, rad/s.
         qdd_before: Joint accelerations at the previous stage, rad/s^2.
         actors: Rows of the operators and environments that act on the arm.
-        table: Tables of numbers to which these rows refer.
+        table: Data tables to which these rows refer.
     """
     return two_link_stages.advance_stage(
         t_s=t_s,
@@ -175,11 +175,11 @@ def use_states(
         lanes: Number of lanes to compute.
         i: Index of the site.
         block_row: Row of the tick in `used`.
-        pages: Number of latest states of each site in `states`, a power of two.
+        pages: Number of latest states stored per site in `states`, a power of two.
         shared: Number of coordinates that sites share.
         site: Row of the site.
-        links: Rows of its links; changed.
-        received: Rows with the values that the peers' laws sent; changed.
+        links: Rows of its links; updated in place.
+        received: Rows with the values sent by the peers' laws; updated in place.
         states: The latest states of all sites, see `advance_site`.
         used: Sample in use by peer, lane and tick of a block; -1 before the first.
         columns: Indices of the received values, see `LaneLaw`, shape (P, C).
@@ -228,19 +228,19 @@ def put_sent_numbers(
     sent: Any,
     states: Array,
 ) -> None:
-    """Copies the values that the law of an arm sends to the arm's record and latest state.
+    """Copies the values sent by an arm's control law to the arm's record and latest state.
 
     Args:
-        k: The tick, see `number_of`.
+        k: Current tick, see `number_of`.
         lanes: Number of lanes to compute.
         i: Index of the site.
-        pages: Number of latest states of each site in `states`, a power of two.
+        pages: Number of latest states stored per site in `states`, a power of two.
         record_row: Row of the tick in `record`.
         shared: Number of coordinates that sites share.
         site: Row of the site.
-        record: Rows with the floats of its latest records; one is changed.
-        sent: Row with the values that the law sends.
-        states: The latest states of all sites, see `advance_site`; changed.
+        record: Rows of its latest records; one is updated.
+        sent: Row with the values sent by the law.
+        states: The latest states of all sites, see `advance_site`; updated in place.
     """
     for c in range(in_lane(site, 0)[0].sent):
         for lane in range(lanes):
@@ -283,38 +283,38 @@ def advance_site(
 ) -> None:
     """Computes one control period of an arm for several simulations that run side by side.
 
-    All arrays have a place (lane) for each simulation. No two arrays overlap in memory.
+    All arrays have one entry (lane) per simulation, and no two arrays may overlap in memory.
 
     Args:
-        k: The tick, of all lanes or of each lane, see `number_of`.
-        t_ns: Nominal time of the tick, ns since the epoch, of all lanes or of each lane.
+        k: Current tick, for all lanes or per lane, see `number_of`.
+        t_ns: Nominal time of the tick, ns since the epoch, for all lanes or per lane.
         lanes: Number of lanes to compute, at most `LANES`.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
         block_row: Row of the tick in `used`.
-        pages: Number of latest states of each site in `states`, a power of two.
+        pages: Number of latest states stored per site in `states`, a power of two.
         bucket: Row of the tick in `peaks`.
         record_row: Row of the tick in `record`.
         site: Row of the site.
         links: Rows of its links.
         actors: Rows of its operators and environments.
-        environments: Rows of the environments alone.
-        ramps: Row with the changes of its dominance factors.
-        record: Rows with the floats of its latest records; one is written.
+        environments: Rows of its environments only.
+        ramps: Row of planned changes of its dominance factors.
+        record: Rows of its latest records; one is written.
         peaks: Peaks of the site, one row per bucket, see `update_peaks`.
         sums: Sums of the site.
         progress: Progress of the site.
         scratch: Row that buffers the stages of the integrator, see `STAGES_DTYPE`.
         law: Row with the gains and memory of the site's compiled law.
-        received: Rows with the values that the peers' laws sent.
-        sent: Row with the values that the law sends.
+        received: Rows with the values sent by the peers' laws.
+        sent: Row with the values sent by this law.
         code: Selects the code of the law, see `LawCode`.
-        states: The latest states of all sites (q, qd, tau_x and the values that the law sent),
+        states: The latest states of all sites (q, qd, tau_x and the values sent by the law),
             shape (N, pages + 1, LANES, width). The last page holds the state before the first
             tick.
         used: Sample in use by peer, lane and tick of a block; -1 before the first.
         columns: Indices of the received values, see `LaneLaw`, shape (P, C).
-        table: Tables of the operators and environments of all sites, equal in all runs.
+        table: Tables of the operators and environments of all sites, the same in all runs.
     """
     use_states(
         t_ns=t_ns,
@@ -410,8 +410,8 @@ def advance_site(
         states=states,
     )
 
-    # 8 advance. Each stage of the integrator has its own loop: in a short loop, the processor
-    # begins with the next lanes while it waits for the results of the previous lanes.
+    # 8 advance. Each stage of the integrator has its own loop. In a short loop, the processor
+    # can start on the next lanes while waiting for the results of the previous ones.
     for lane in range(lanes):
         s = in_lane(site, lane)[0]
         if s.mode != _DIVERGED:
@@ -515,24 +515,24 @@ def advance_site(
 
 
 class EndedRuns(NamedTuple):
-    """States of ended runs, at the time at which one of their arms left its limits.
+    """States of runs that have ended, at the time at which one of their arms left its limits.
 
-    Several runs are simulated side by side, each in a lane. A run that has ended stays in its
-    lane, but its later numbers have no meaning. Therefore its last valid state is copied here.
-    N is the number of sites (arm controllers), and the last axis of each array is the lane.
+    A run that has ended stays in its lane, but its later values are meaningless. Its last valid
+    state is therefore copied here. N is the number of sites, and the last axis of each array is
+    the lane.
 
     Attributes:
-        ticks: Number of ticks that the first site of each run has executed, shape (LANES,). -1
-            if the run has not ended.
-        site_ticks: Number of ticks that each site has executed, shape (N, LANES).
+        ticks: Number of ticks executed by the first site of each run, shape (LANES,). -1 if the
+            run has not ended.
+        site_ticks: Number of ticks executed by each site, shape (N, LANES).
         site_rows: Rows of the sites, shape (N, words per row, LANES).
         links: Rows of the links, shape (N P, words per row, LANES). Only `LaneEpisodes` keeps
             them, because copying them in `keep_ended_runs` makes all ticks slower by half.
         records: Records, shape (N, floats, LANES).
         sums: Rows of the sums, shape (N, words per row, LANES).
         progress: Rows of the progress, shape (N, words per row, LANES).
-        laws: Gains and memory of compiled laws, shape (N, numbers, LANES).
-        sent: Values that these laws send, shape (N, numbers, LANES).
+        laws: Gains and memory of compiled laws, shape (N, values, LANES).
+        sent: Values sent by these laws, shape (N, values, LANES).
         peaks: Peaks in the bucket of this time, shape (N, 3 n, LANES).
     """
 
@@ -553,9 +553,9 @@ def copy_lane(lane: int, source: Words, target: Words) -> None:
     """Copies the state of one simulation from one array of several simulations to another.
 
     Args:
-        lane: Index of the run (its lane).
-        source: Numbers of all sites in all runs, shape (N, numbers, LANES).
-        target: Receives the numbers of the run, in the same form.
+        lane: Lane index of the run.
+        source: Values of all sites in all runs, shape (N, values, LANES).
+        target: Output array of the same form.
     """
     for i in range(source.shape[0]):
         for word in range(source.shape[1]):
@@ -574,19 +574,19 @@ def keep_ended_runs(
 ) -> int:
     """Stores the final state of each run in which an arm left its limits in this tick.
 
-    The other runs continue, so the numbers in the lane of an ended run are overwritten later.
+    The other runs continue, which overwrites the values in the lane of a run that has ended.
 
     Args:
-        ticks: Number of ticks that the first site has executed: one number for all runs, or one
+        ticks: Number of ticks executed by the first site: a single value for all runs, or one
             per run.
         runs: Number of runs.
         mode_word: Index of the mode among the words of a site's row.
-        latest: For each site, the number of its ticks, the bucket of its latest tick, and the
-            row of the record of this tick, shape (3, N).
+        latest: For each site, its number of ticks, the bucket of its latest tick, and the row
+            of that tick's record, shape (3, N).
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
-        present: Numbers of all runs now, with several rows of records per site. Its peaks are
-            not used.
-        ended: Receives the numbers of runs that end in this tick.
+        present: Current values of all runs, with several rows of records per site. Its peaks
+            are not used.
+        ended: Output for the values of runs that end in this tick.
 
     Returns:
         The number of runs that have not ended.
@@ -618,14 +618,14 @@ def keep_ended_runs(
 class RecordedHands(NamedTuple):
     """Torques or targets with which live operators moved the arms in a recorded run.
 
-    A repetition of the run applies them again, see `ReplayedInputs`.
+    They are applied again when the run is repeated, see `ReplayedInputs`.
 
     Attributes:
-        actions: Numbers of the operators, shape (N, ticks, C).
-        rows: Row of the operator of each site among all operators and environments. -1 without
-            an operator.
+        actions: Actions of the operators, shape (N, ticks, C).
+        rows: For each site, the row of its live operator among all operators and environments,
+            or -1 if there is none.
         row_words: Words of the row that the actions replace.
-        columns: Index of the action's number for each of these words.
+        columns: For each of these words, its column in the action.
     """
 
     actions: Array
@@ -644,10 +644,10 @@ def _apply_recorded_hand(
 
     Args:
         i: Index of the site.
-        k: The tick.
+        k: Current tick.
         lanes: Number of lanes.
         hands: Actions of the operators.
-        actors: Rows of operators and environments, seen as floats; written.
+        actors: Rows of operators and environments, viewed as floats; updated in place.
     """
     if hands.rows[i] < 0 or k >= hands.actions.shape[1]:
         return
@@ -677,24 +677,24 @@ def call_site(
 ) -> None:
     """Calls the compiled code that computes one control period of an arm for several runs.
 
-    The arguments after `address` are those of `advance_site`. In place of the tables of that
-    function, from `site` to `_chain`, `tables` contains their addresses in the same order.
+    The arguments after `address` are those of `advance_site`, except that `tables` contains the
+    addresses of the tables from `site` to `_chain`, in the same order.
 
     Args:
         address: Address of the code of `advance_site` or `advance_chain_site`.
-        k: The tick of all lanes, or a pointer to the ticks of the lanes.
+        k: The tick of all lanes, or a pointer to the tick of each lane.
         t_ns: Nominal time of the tick, ns since the epoch, in the same form.
         lanes: Number of lanes to compute.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
         block_row: Row of the tick in `used`.
-        pages: Number of latest states of each site in `states`.
+        pages: Number of latest states stored per site in `states`.
         bucket: Row of the tick in the table of peaks.
         record_row: Row of the tick in the table of records.
         tables: Addresses of the tables of the site, shape (15,).
         states: The latest states of all sites.
         used: Samples in use of the site.
-        columns: Indices of the values that the site's law receives.
+        columns: Indices of the values received by the site's law.
         table: Tables of the operators and environments.
     """
     call_address(
@@ -761,36 +761,36 @@ def run_block(
 
     Args:
         first: First tick of each site in the block, shape (N,).
-        ticks: Number of ticks that each site has executed, shape (N,); changed.
+        ticks: Number of ticks executed by each site, shape (N,); updated in place.
         end: Tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
         next_ns: Buffer for the time of the next tick of each site, ns, shape (N,).
-        latest: Buffer for the numbers of the latest tick, see `keep_ended_runs`.
+        latest: Buffer for information about the latest tick, see `keep_ended_runs`.
         runs: Number of runs.
         settled_rad: Position error below which an arm counts as settled, rad.
-        pages: Number of latest states of each site, a power of two.
+        pages: Number of latest states stored per site, a power of two.
         mode_word: Index of the mode among the words of a site's row.
-        record_rows: Number of latest records of each site that are kept, a power of two.
+        record_rows: Number of latest records kept per site, a power of two.
         addresses: Address of the code of `advance_site` or `advance_chain_site` for each site,
             shape (N,).
-        tables: For each site the addresses of its tables, in the order of the arguments of
+        tables: For each site, the addresses of its tables, in the order of the arguments of
             `advance_site`, shape (N, 15).
         states: The latest states of all sites, see `advance_site`.
         used: Samples in use, shape (N, P, LANES, ticks), see `use_samples`.
         columns: Indices of the values that laws receive, shape (N, P, C).
         table: Tables of the operators and environments.
         hands: Actions of live operators in a recorded run.
-        actors: Rows of operators and environments, seen as floats.
+        actors: Rows of operators and environments, viewed as floats.
         peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
-        present: The numbers of all runs.
-        ended: Numbers of the runs that have ended; changed.
+        present: Current values of all runs.
+        ended: Values of the runs that have ended; updated in place.
 
     Returns:
         The number of runs that have not ended.
     """
     running = runs
-    # Compute whole vector registers: the numbers of lanes without a run have no meaning. One or
-    # two additional lanes are faster without vectors.
+    # Compute complete vector registers, although the results in lanes without a run are
+    # meaningless. For one or two additional lanes, scalar code is faster.
     lanes = runs if 0 < runs % 8 <= 2 else (runs + 7) // 8 * 8
     for i in range(addresses.shape[0]):
         next_ns[i] = tick_ns(ticks[i], rates_hz[i]) if ticks[i] < end[i] else NEVER_NS

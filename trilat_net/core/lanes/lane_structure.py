@@ -1,12 +1,12 @@
 """Decides which simulations can be computed together with vector instructions.
 
 Vector instructions evaluate the same equations for several runs. Runs can therefore be computed
-together if they differ in numbers only, such as gains or start poses. Properties that select
-the equations, for example the kind of control law, form the structure of a run. `find_obstacle`
-explains why a run must be computed alone.
+together if they differ only in numerical values, such as gains or start poses. Properties that
+select the equations, for example the type of control law, form the structure of a run.
+`find_obstacle` explains why a run must be computed alone.
 
 Invariant:
-    - Two runs with the same structure use the same compiled code and the same number tables.
+    - Two runs with the same structure use the same compiled code and the same data tables.
 """
 
 from typing import Any, NamedTuple
@@ -27,20 +27,20 @@ SITE_CONSTANTS: tuple[str, ...] = (
 )
 """Fields of a site's row that are equal in runs of one structure and constant in each run."""
 _CHANGED_BY_GLIDE = ("reason", "regrouped")
-"""Fields among them that are not constant under the rule `glide`."""
+"""Those of these fields that are not constant under the rule `glide`."""
 _ACTOR_CONSTANTS = ("kind", "sampled", "table_first", "table_count")
-"""Fields of the row of an operator or environment that are equal in runs of one structure."""
+"""Fields in the row of an operator or environment that are equal in runs of one structure."""
 
 
 class SiteStructure(NamedTuple):
-    """Properties of one site that select its equations, such as the kind of its control law.
+    """Properties of one site that select its equations, such as its type of control law.
 
-    A site is a simulated arm with its controller. Sites with equal properties share code.
+    Sites with equal properties share code.
 
     Attributes:
         constants: Constants of the site.
-        actors: Constants of each operator and environment, the operators first.
-        first_environment: Index of the first environment. -1 if there is no environment.
+        actors: Constants of each operator and environment, operators first.
+        first_environment: Index of the first environment, or -1 if there is none.
         law: Compiled law of the site.
         prismatic: For each joint of a chain, 1 if it is prismatic, 0 if it is revolute.
     """
@@ -55,13 +55,13 @@ class SiteStructure(NamedTuple):
 class RunStructure(NamedTuple):
     """Properties of a run that select its equations. Runs with equal properties share code.
 
-    Runs that differ only in numbers, such as gains or delays, have equal structures.
+    Runs that differ only in numerical values, such as gains or delays, have equal structures.
 
     Attributes:
-        sites: Structure of each site (arm controller).
-        peers: Number of other sites from which each site receives samples (sent states).
+        sites: Structure of each site.
+        peers: Number of peers from which each site receives samples.
         ramps: Largest number of planned changes of the dominance factors.
-        table: Shape and content of the table of numbers of the operators and environments.
+        table: Shape and content of the data table of the operators and environments.
         duration_s: Planned duration of the run, s.
         settled_rad: Position error below which an arm counts as settled, rad.
     """
@@ -75,13 +75,13 @@ class RunStructure(NamedTuple):
 
     @classmethod
     def find(cls, run: CompiledRun) -> "RunStructure":
-        """Returns the properties of a run that decide with which other runs it can be computed.
+        """Returns the properties of a run that must match for runs to be computed together.
 
-        For example, two runs with the same control laws but different gains have the same
-        result.
+        For example, the result is the same for two runs with the same control laws but
+        different gains.
 
         Args:
-            run: The run. `find_obstacle` must find no reason against computing it in a lane.
+            run: The run. `find_obstacle` must have found no obstacle to computing it in a lane.
         """
         memory = run.memory
         tables = memory.tables
@@ -112,25 +112,26 @@ class RunStructure(NamedTuple):
 
 
 def _read_constants(row: np.void, names: tuple[str, ...]) -> Constants:
-    """Returns the values of integer fields of a row, with their names."""
+    """Returns integer fields of a row as pairs of name and value."""
     return tuple((name, int(row[name])) for name in names)
 
 
 def _list_actors(actors: Any) -> list[Any]:
-    """Returns the rows of a site's torque sources, without rows that only fill the array."""
+    """Returns the rows of a site's torque sources, excluding rows that only pad the array."""
     return [row for row in actors if row["sampled"] in (0, 1)]
 
 
 def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
-    """Explains why a run cannot be simulated side by side with other runs, for the user.
+    """Explains to the user why a run cannot be simulated side by side with other runs.
 
     Args:
-        run: The run before its first tick (control period).
-        hand_site: Index of a site (arm controller) whose live operator the caller replaces,
-            because it knows the actions of this operator. -1 if there is no such site.
+        run: The run before its first tick.
+        hand_site: Index of a site whose live operator is replaced by the caller, who knows this
+            operator's actions. -1 if there is no such site.
 
     Returns:
-        The property of the run that lanes do not support. Empty if lanes support the run.
+        The property of the run that lanes do not support, or an empty string if lanes support
+        the run.
     """
     config: Any = numba.config
     tables = run.memory.tables
@@ -143,7 +144,7 @@ def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
 
     kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
     if kinds.intersection(OWN_KINDS):
-        return "operators or environments that users wrote"
+        return "user-written operators or environments"
     return ""
 
 

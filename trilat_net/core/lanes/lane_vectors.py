@@ -1,19 +1,19 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
 # mypy: disable-error-code="no-any-return, override"
-"""Lets a function for one run compute eight runs, by a vector type for its numbers.
+"""Lets a function written for one run compute eight runs, using a vector type for its values.
 
-A loop over runs becomes vector instructions if the loop over runs is the innermost one. In the
-dynamics of a chain of joints, the innermost loops go from joint to joint. The compiler would
-vectorise these, although their numbers are not adjacent in memory. Therefore this module
-defines a type of Numba for a value that consists of eight numbers, one for each run. In a
-function that is compiled for this type, `a + b` adds eight pairs of numbers by one instruction.
-The source of the function is not changed.
+A loop over runs becomes vector instructions only if it is the innermost loop. In the dynamics
+of a chain of joints, the innermost loops go from joint to joint. The compiler would vectorise
+those, although their values are not adjacent in memory. This module therefore defines a Numba
+type for a value that consists of eight numbers, one per run. In a function compiled for this
+type, a single instruction computes `a + b` for all eight runs. The source of the function is
+not changed.
 
-A function that branches on such a value is rejected when it is compiled, because the eight runs
-may need different branches. The function must use `choose` instead.
+A function that branches on such a value is rejected at compile time, because the eight runs may
+need different branches. The function must use `choose` instead.
 
 Invariant:
-    - Each number of a result is computed by the same operations from the same numbers as in a
+    - Each element of a result is computed by the same operations from the same operands as in a
       run that is computed alone.
 """
 
@@ -42,7 +42,7 @@ from ..step.vectors import choose, holds_anywhere, round_down, whole
 from .lane_rows import LANES, Constants, LaneField, LaneTable, RowType, make_view, offset_rows
 
 GROUP = 8
-"""Number of runs whose numbers form one value: the doubles of the longest register."""
+"""Number of runs whose values form one vector: the doubles that fit in one register."""
 _WORD = 8
 _WORD_TYPE = ir.IntType(64)
 _LLVM_KINDS = {
@@ -53,12 +53,12 @@ _LLVM_KINDS = {
 
 
 class LaneVector(types.Type):
-    """Numba type of eight numbers, one for each of eight runs, in one vector register.
+    """Numba type of eight numbers in one vector register, one for each of eight runs.
 
-    One SIMD instruction then computes a number of all eight runs.
+    One SIMD instruction then computes a value for all eight runs.
 
     Args:
-        kind: Kind of the number: "f8" for a float, "i8" for an integer, "b1" for a condition.
+        kind: Element type: "f8" for a float, "i8" for an integer, "b1" for a condition.
     """
 
     in_lanes = True
@@ -69,23 +69,23 @@ class LaneVector(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         return "LaneVector", (self.kind,)
 
     def can_convert_from(self, _context: Any, other: Any) -> Any:
-        """Tells Numba that one number may be used where a vector of eight floats is needed.
+        """Tells Numba that a scalar may be used where a vector of eight floats is needed.
 
-        The number is then repeated eight times. Returns None, which forbids the conversion, for
+        The scalar is then repeated eight times. Returns None, which forbids the conversion, for
         vectors of integers or conditions, and for values that are not numbers.
         """
         is_number = isinstance(other, types.Float | types.Integer)
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """Returns the type of a variable that is a vector or a number, depending on the branch.
+        """Returns the type of a variable that is a vector in one branch, a scalar in another.
 
-        Numba requires a single type per variable. It is this vector type, so that the number is
-        repeated for all eight runs. Returns None, which is an error of compilation, if the
+        Numba requires a single type per variable. This is the vector type, in which the scalar
+        is repeated for all eight runs. Returns None, which is a compilation error, if the
         vector does not contain floats or if the other value is not a number.
         """
         is_number = isinstance(other, types.Float | types.Integer)
@@ -99,14 +99,14 @@ CONDITIONS = LaneVector("b1")
 
 @register_model(LaneVector)
 class _VectorModel(models.PrimitiveModel):
-    """Represents a `LaneVector` in machine code by a vector of LLVM."""
+    """Represents a `LaneVector` in machine code as an LLVM vector."""
 
     def __init__(self, manager: Any, numba_type: LaneVector) -> None:
         super().__init__(manager, numba_type, _LLVM_KINDS[numba_type.kind])
 
 
 def _repeat(builder: Any, number: Any, vector_type: Any) -> Any:
-    """Generates LLVM code for a vector of equal numbers."""
+    """Generates LLVM code for a vector whose elements are all equal."""
     undefined = ir.Constant(vector_type, ir.Undefined)
     first = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
     places = ir.Constant(ir.VectorType(ir.IntType(32), GROUP), [0] * GROUP)
@@ -114,7 +114,7 @@ def _repeat(builder: Any, number: Any, vector_type: Any) -> Any:
 
 
 def _cast_number(context: Any, builder: Any, source: Any, _target: Any, number: Any) -> Any:
-    """Generates LLVM code for the conversion of a number to a vector of floats."""
+    """Generates LLVM code that converts a scalar to a vector of floats."""
     as_float = context.cast(builder, number, source, types.float64)
     return _repeat(builder, as_float, _LLVM_KINDS["f8"])
 
@@ -128,9 +128,9 @@ def _is_number(numba_type: Any) -> bool:
 
 
 def _define_binary(function: Any, result: LaneVector, generate: Callable[..., Any]) -> None:
-    """Tells Numba how to compute an operation such as `a + b` with vectors of eight numbers.
+    """Tells Numba how to compute an operation such as `a + b` on vectors of eight elements.
 
-    One of the operands may be a single number, which is then used for all eight runs.
+    One of the operands may be a scalar, which is then used for all eight runs.
 
     Args:
         function: The operation as a function, such as `operator.add`.
@@ -166,7 +166,7 @@ def _define_unary(function: Any, generate: Callable[..., Any]) -> None:
 
 
 def _call_llvm(name: str) -> Callable[..., Any]:
-    """Returns a function that generates the call of an LLVM function, such as sqrt."""
+    """Returns a function that generates a call to an LLVM function, such as sqrt."""
 
     def generate(builder: Any, number: Any) -> Any:
         floats = _LLVM_KINDS["f8"]
@@ -250,7 +250,7 @@ _define_integers(operator.ne, CONDITIONS, lambda builder, a, b: builder.icmp_sig
 
 @intrinsic
 def _select(_context: Any, condition: Any, if_true: Any, if_false: Any) -> Any:
-    """Generates LLVM code that chooses between two vectors by eight conditions."""
+    """Generates LLVM code that selects elements from two vectors based on eight conditions."""
     if condition != CONDITIONS:
         return None
     if not all(kind == FLOATS or _is_number(kind) for kind in (if_true, if_false)):
@@ -264,7 +264,7 @@ def _select(_context: Any, condition: Any, if_true: Any, if_false: Any) -> Any:
 
 @intrinsic
 def _truncate(_context: Any, number: Any) -> Any:
-    """Generates LLVM code for the conversion of floats to integers."""
+    """Generates LLVM code that converts floats to integers."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.fptosi(args[0], _LLVM_KINDS["i8"])
@@ -289,7 +289,7 @@ truncate_vector: Any = _truncate
 
 
 def _choose_vector(condition: Any, if_true: Any, if_false: Any) -> Any:
-    """Chooses between two vectors by eight conditions: `choose` for eight runs at once."""
+    """Selects elements from two vectors based on eight conditions: `choose` for eight runs."""
     return select_vector(condition, if_true, if_false)
 
 
@@ -317,7 +317,7 @@ set_lane_form(whole, lambda _types: _whole_vector)
 
 
 class _GroupType(types.Type):
-    """Numba's type of some rows of a `LaneTable` in eight lanes: a pointer."""
+    """Numba type of some rows of a `LaneTable` in eight lanes, represented as a pointer."""
 
     in_lanes = True
 
@@ -330,7 +330,7 @@ class _GroupType(types.Type):
 
     @property
     def mangling_args(self) -> tuple[str, tuple[str]]:
-        """Name of this type in the names of compiled functions, which Numba needs."""
+        """Form of this type that Numba uses in the names of compiled functions."""
         digest = hashlib.sha256(self.name.encode()).hexdigest()
         return type(self).__name__, (f"g{digest[:16]}",)
 
@@ -338,8 +338,8 @@ class _GroupType(types.Type):
 class _RowsInGroup(_GroupType):
     """Numba type of an array of records of eight simulations, for SIMD vector instructions.
 
-    Eight runs (lanes) are simulated side by side. Indexing the array, for example with the
-    number of a network link, gives a `_RowInGroup`: the record of this link in all eight runs.
+    Eight runs (lanes) are simulated side by side. Indexing the array, for example by the number
+    of a network link, yields a `_RowInGroup`: the record of this link in all eight runs.
     """
 
 
@@ -347,7 +347,7 @@ class _RowInGroup(RowType, _GroupType):
     """Numba type of one record of eight simulations at once, for SIMD vector instructions.
 
     A record (row) contains, for example, the state of one arm. Eight runs (lanes) are simulated
-    side by side, so that a field of the row, such as an angle, is a vector of eight numbers
+    side by side, so a field of the row, such as an angle, is a vector of eight values
     (`LaneVector`), one per run.
     """
 
@@ -355,7 +355,7 @@ class _RowInGroup(RowType, _GroupType):
 @register_model(_RowsInGroup)
 @register_model(_RowInGroup)
 class _GroupModel(models.PrimitiveModel):
-    """Represents rows in eight lanes in machine code by a pointer."""
+    """Represents rows in eight lanes in machine code as a pointer."""
 
     def __init__(self, manager: Any, numba_type: Any) -> None:
         super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
@@ -366,7 +366,7 @@ _EQUAL_IN_ALL_RUNS = ("prismatic",)
 
 
 def _vector_of(field: LaneField) -> LaneVector:
-    """Returns the `LaneVector` for the numbers of a field."""
+    """Returns the `LaneVector` for the values of a field."""
     return FLOATS if field.kind == "f8" else INTEGERS
 
 
@@ -401,23 +401,23 @@ class _RowsAttributes(AttributeTemplate):
 
 
 def _find_numbers(builder: Any, pointer: Any, field: LaneField) -> Any:
-    """Generates LLVM code for the address of the first vector of a field."""
+    """Generates LLVM code for the address of a field's first vector."""
     numbers = offset_rows(builder, pointer, field.first_word)
     return builder.bitcast(numbers, _LLVM_KINDS[_vector_of(field).kind].as_pointer())
 
 
 @lower_getattr_generic(_RowInGroup)
 def _read_field(context: Any, builder: Any, row_type: _RowInGroup, row: Any, name: str) -> Any:
-    """Generates LLVM code for reading `row.field` of a row in eight lanes (runs) at once.
+    """Generates LLVM code that reads `row.field` of a row in eight lanes (runs) at once.
 
     Numba calls this function when it compiles such an expression. The result is a constant if
-    the field is equal in all lanes, a vector of eight numbers if the field is a single number,
-    and otherwise an array of such vectors.
+    the field is equal in all lanes, otherwise a vector of eight elements for a scalar field,
+    and an array of such vectors for any other field.
 
     Args:
-        context: Numba's context of the compilation.
-        builder: Appends LLVM instructions.
-        row_type: Numba's type of the row.
+        context: Numba's compilation context.
+        builder: Builder that appends LLVM instructions.
+        row_type: Numba type of the row.
         row: The row, as an LLVM value.
         name: Name of the field.
     """
@@ -438,7 +438,7 @@ def _read_field(context: Any, builder: Any, row_type: _RowInGroup, row: Any, nam
 
 @lower_setattr_generic(_RowInGroup)
 def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
-    """Generates LLVM code for writing a vector to `row.field`."""
+    """Generates LLVM code that writes a vector to `row.field`."""
     row_type, value_type = sig.args
     field = row_type.find_field(name)
     value = context.cast(builder, args[1], value_type, _vector_of(field))
@@ -454,7 +454,7 @@ def _read_shape(context: Any, builder: Any, rows: _RowsInGroup, _value: Any, _na
 
 @infer_global(operator.getitem)
 class _RowsItem(AbstractTemplate):
-    """Tells Numba the type of `rows[index]`, if all rows have the same constants."""
+    """Tells Numba the type of `rows[index]` if all rows have the same constants."""
 
     def generic(self, args: Any, _keywords: Any) -> Any:
         rows, index = args
@@ -475,7 +475,7 @@ def _get_item(_context: Any, builder: Any, sig: Any, args: Any) -> Any:
 
 @intrinsic
 def _in_group(_context: Any, table: Any, _group: Any) -> Any:
-    """Generates LLVM code for the rows of eight adjacent runs (lanes) in a common array."""
+    """Generates LLVM code for the rows of eight adjacent runs (lanes) in a shared array."""
     assert isinstance(table, LaneTable)
     rows_type = _RowsInGroup(table, table.constants)
 

@@ -1,14 +1,14 @@
 """Simulates many runs as fast as possible: together with vector instructions, or one by one.
 
-Parameter sweeps and tuning call `RunGroup.divide` with all their runs. Runs with equal
-structure form groups, which are computed in lanes of the vector registers. All other runs are
-computed alone. The caller need not know which runs were computed together:
+Parameter sweeps and tuning pass all their runs to `RunGroup.divide`. Runs with equal structure
+form groups, which are computed in lanes of the vector registers. All other runs are computed
+alone. Callers do not need to know which runs are computed together:
 
     for group in RunGroup.divide(runs):
         group.advance_to(10.0)
 
 Invariant:
-    - The numbers of a run do not depend on the other runs.
+    - The results of a run do not depend on the other runs.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -19,34 +19,33 @@ from .lane_run import LaneRun, explain_uncompilable, has_lane_code
 from .lane_structure import RunStructure, find_obstacle
 
 LEAST_RUNS = 4
-"""Number of runs from which lanes are faster than one run after the other."""
+"""Number of runs from which lanes are faster than running them one by one."""
 
 
 LANE_SITE_TICKS = 100_000_000
 """Number of site ticks from which a study compiles the code for several runs side by side.
 
-The compilation takes about ten seconds per kind of site. The code then saves about 0.4 us per
-site tick.
+Compilation takes about ten seconds per type of site. The code then saves about 0.4 us per site
+tick.
 """
 
 
 class RunGroup:
-    """Several simulations that advance together, by vector instructions where possible.
+    """Several simulations that advance together, using vector instructions where possible.
 
-    Otherwise they are computed one after the other.
+    Otherwise, they are computed one after another.
 
     Args:
         members: Indices of the runs in the sequence that was divided into groups.
-        runs: The runs before their first tick (control period).
+        runs: The runs before their first tick.
         in_lanes: True to compute them together, each in a lane of the vector registers. They
             must have the same structure.
-        obstacle: Property that prevents computing the runs together. Empty if nothing does.
-        record_rows: Number of latest records of each site (arm controller) that are kept, a
-            power of two.
+        obstacle: Property that prevents computing the runs together. Empty if there is none.
+        record_rows: Number of latest records kept per site, a power of two.
 
     Attributes:
-        members: Indices of the runs that are left in the group.
-        obstacle: The value of the argument.
+        members: Indices of the runs that remain in the group.
+        obstacle: The obstacle passed to the constructor.
     """
 
     def __init__(
@@ -64,18 +63,18 @@ class RunGroup:
         self._lanes = LaneRun(runs, record_rows) if in_lanes else None
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the simulated runs of the group up to a time. Repeated calls are allowed.
+        """Continues the runs of the group up to a given time. May be called repeatedly.
 
         Args:
-            until_s: The time, s, later than that of the previous call.
+            until_s: The time, s, later than in the previous call.
         """
         if self._lanes is not None:
             try:
                 self._lanes.advance_to(until_s)
             except Exception:
-                # The law of one run failed, which ended the tick of all runs. Each run still
-                # has the state of the previous call. Computed one by one, only the run whose
-                # law fails ends.
+                # The law of one run failed, which aborted the tick for all runs. Each run still
+                # has its state from the previous call. When they are computed one by one, only
+                # the run whose law fails ends.
                 self._lanes = None
             else:
                 return
@@ -83,9 +82,10 @@ class RunGroup:
             run.advance_to(until_s)
 
     def keep(self, chosen: Sequence[int]) -> None:
-        """Continues with some of the runs only, so that no time is spent on other runs.
+        """Drops all runs except the given ones.
 
-        A search for the best gains, for example, drops runs that are already worse than others.
+        A search for the best gains, for example, saves time by dropping runs that are already
+        worse than others.
 
         Args:
             chosen: Indices in `members` of the runs that continue, in ascending order. No arm
@@ -98,19 +98,19 @@ class RunGroup:
 
     @staticmethod
     def divide(runs: Sequence[CompiledRun], record_rows: int = 1) -> "Iterator[RunGroup]":
-        """Divides runs into groups, each of which can be simulated together.
+        """Divides runs into groups of runs that can be simulated together.
 
-        Runs that differ in numbers only, such as gains, are in the same group. A run that must
-        be computed alone gets a group of its own.
+        Runs that differ only in numerical values, such as gains, are in the same group. A run
+        that must be computed alone forms its own group.
 
         Args:
-            runs: The runs before their first tick (control period).
-            record_rows: Number of ticks whose records (results of control periods) are kept for
-                `CompiledRun.pop_records` after each call of `RunGroup.advance_to`, a power of
-                two.
+            runs: The runs before their first tick.
+            record_rows: Number of ticks whose records are kept for `CompiledRun.pop_records`
+                after each call of `RunGroup.advance_to`, a power of two.
 
         Yields:
-            The groups. Each group is created when the work on the previous group has ended.
+            The groups. Each group is created only when the caller is done with the previous
+            one.
         """
         groups: dict[RunStructure, list[int]] = {}
         for index, run in enumerate(runs):
@@ -120,7 +120,7 @@ class RunGroup:
             else:
                 groups.setdefault(RunStructure.find(run), []).append(index)
 
-        # A group has at most as many runs as the vector code has lanes.
+        # A group contains at most as many runs as the vector code has lanes.
         for indices in groups.values():
             for first in range(0, len(indices), LANES):
                 members = indices[first : first + LANES]
@@ -140,17 +140,16 @@ class RunGroup:
         runs: int,
         least_site_ticks: float = LANE_SITE_TICKS,
     ) -> bool:
-        """Decides whether a study computes its runs together, and then compiles the code.
+        """Decides whether a study computes its runs together, and compiles the code if so.
 
-        Runs are computed together, with vector instructions, if the code exists already, or if
-        they are so long that compiling it pays off.
+        Runs are computed together, with vector instructions, if the compiled code already
+        exists, or if they are long enough for compiling it to pay off.
 
         Args:
             make_run: Function that returns one of the runs before its first tick.
             runs: Number of runs with this structure.
-            least_site_ticks: Number of simulated ticks (control periods), summed over all sites
-                (arm controllers) and runs, from which compiling the code pays off. Infinity
-                uses existing code only.
+            least_site_ticks: Number of simulated ticks, summed over all sites and runs, from
+                which compiling the code pays off. Infinity to use existing code only.
         """
         probes = [make_run() for _ in range(LEAST_RUNS)]
         site_ticks = runs * probes[0].duration_s * sum(probes[0].rates_hz)
@@ -166,12 +165,13 @@ class RunGroup:
     def describe_structure(run: CompiledRun) -> Hashable:
         """Returns a key for sorting runs into groups that can be simulated side by side.
 
-        The key is equal for runs that differ in numbers only, such as gains.
+        The key is equal for runs that differ only in numerical values, such as gains.
 
         Args:
             run: The run before its first tick.
 
         Returns:
-            The structure of the run. If the run must be computed alone, the reason for this.
+            The structure of the run, or, if the run must be computed alone, the reason for
+            that.
         """
         return find_obstacle(run) or RunStructure.find(run)

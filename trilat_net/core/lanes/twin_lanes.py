@@ -1,13 +1,13 @@
-"""Simulates a run together with its twins, copies of the run that start slightly displaced.
+"""Simulates a run together with its twins, which are copies that start slightly displaced.
 
-The distance between a run and its twins shows whether small disturbances grow (`twins`). The
-run and the twins are computed at once, each in one lane of the vector registers. All of them
-receive the same samples (states of the other arms) at the same times, so the deliveries of the
-simulated network are computed once for all runs.
+The distance between a run and its twins shows whether small perturbations grow (`twins`). The
+run and its twins are computed at once, each in one lane of the vector registers. They all
+receive the same samples at the same times, so the deliveries of the simulated network are
+computed only once.
 
 Invariant:
-    - The states and the records are those of `CompiledRun`, bit for bit, as long as no arm
-      leaves its limits.
+    - As long as no arm leaves its limits, states and records are bit-identical to those of
+      `CompiledRun`.
 """
 
 from collections.abc import Sequence
@@ -32,37 +32,35 @@ from .run_groups import LEAST_RUNS
 class TwinLanes(LaneRun):
     """A run and slightly displaced copies of it (twins), simulated side by side.
 
-    The run has the index (lane) 0.
+    The run itself is in lane 0.
 
     Args:
-        run: The run before its first tick (control period). This object does not advance. See
-            `suits`.
-        count: Number of runs, the twins included.
-        ticks: Number of ticks of each site (arm controller) in the whole run.
-        feed: Inputs of a recorded run that is repeated.
-        kept: Number of records of each site that are kept between two calls of `step_to`.
+        run: The run before its first tick, see `suits`. This object does not advance.
+        count: Number of runs, including the twins.
+        ticks: Number of ticks of each site in the whole run.
+        feed: Inputs of the recorded run to repeat.
+        kept: Number of records per site that are kept between two calls of `step_to`.
     """
 
     class EndedError(Exception):
-        """Error: a run and its displaced copies can no longer be simulated together.
+        """Raised when a run and its displaced copies can no longer be simulated together.
 
-        The reason is that an arm left its limits, or that a control law failed. The caller then
-        simulates the runs again, one by one.
+        This happens when an arm has left its limits or a control law has failed. The caller
+        then simulates the runs again, one by one.
         """
 
     @staticmethod
     def suits(run: CompiledRun, runs: int, ticks: Sequence[int], least_site_ticks: int) -> bool:
         """Returns True if a run and its twins are computed faster together than one by one.
 
-        The twins are copies of the run that start slightly displaced. Computing them together,
-        with vector instructions, has two conditions: all features of the scenario are
-        supported; and the compiled code exists, or the runs are so long that compiling it pays
-        off.
+        Computing them together, with vector instructions, requires that all features of the
+        scenario are supported. In addition, either the compiled code must already exist, or the
+        runs must be long enough for compiling it to pay off.
 
         Args:
-            run: The run before its first tick (control period).
-            runs: Number of runs, the twins included.
-            ticks: Number of ticks of each site (arm controller).
+            run: The run before its first tick.
+            runs: Number of runs, including the twins.
+            ticks: Number of ticks of each site.
             least_site_ticks: Number of simulated ticks, summed over all sites and runs, from
                 which compiling the code pays off.
         """
@@ -81,13 +79,13 @@ class TwinLanes(LaneRun):
     ) -> None:
         """Copies the initial state of a run into the arrays of the run and its twins.
 
-        The twins are copies that are later displaced slightly, to measure whether the
-        difference grows, as it does in an unstable system.
+        The twins will later be displaced slightly. If the system is unstable, their difference
+        from the run grows.
         """
         super().__init__([run], 1 << kept.bit_length())
         self._count = count
         self._feed = feed
-        # The run and its twins have the same initial state, which all lanes contain already.
+        # The run and its twins have the same initial state, which all lanes already contain.
         self.runs = [run] * count
         self._states[:] = self._states[:, :, :1]
         run.plan(ticks)
@@ -103,12 +101,10 @@ class TwinLanes(LaneRun):
         self._changing = floats
 
     def step_to(self, last_ns: int) -> None:
-        """Continues a run and its displaced copies (twins) up to a time, tick by tick.
-
-        A tick is a control period.
+        """Continues a run and its displaced copies (twins) up to a given time, tick by tick.
 
         Args:
-            last_ns: Time of the last tick to be executed, ns since the epoch.
+            last_ns: Time of the last tick to execute, ns since the epoch.
 
         Raises:
             EndedError: An arm left its limits, or a law failed.
@@ -123,11 +119,11 @@ class TwinLanes(LaneRun):
             raise TwinLanes.EndedError
 
     def list_runs(self) -> "list[_LaneTwin]":
-        """Returns the run and its twins, the run first."""
+        """Returns the run, followed by its twins."""
         return [_LaneTwin(self, lane) for lane in range(self._count)]
 
     def _use_samples(self, end: IntArray) -> int:
-        """Computes the samples in use in a block of ticks, which are equal for all runs."""
+        """Computes the samples in use in a block of ticks, which are the same for all runs."""
         if self._feed.first.shape[2] == 0:
             age = super()._use_samples(end)
         else:
@@ -146,33 +142,31 @@ class TwinLanes(LaneRun):
                 state=self._states[0, 0, 0],
                 used=self._used,
             )
-        # The number of runs is rounded up to whole vector registers of eight numbers.
+        # The number of runs is rounded up to complete vector registers of eight values.
         lanes = -(-self._count // 8) * 8
         self._used[:, :, 1:lanes] = self._used[:, :, :1]
         return age
 
     def read_times(self, i: int) -> IntArray:
-        """Returns the times of the control periods of site `i` in the last call of `step_to`.
+        """Returns the times of site `i`'s ticks in the last call of `step_to`.
 
-        The times are in ns since the common start of the sites. A site is the controller of one
-        arm.
+        The times are in ns since the common start of the sites.
         """
-        # The equation of `tick_ns`.
+        # Same equation as in `tick_ns`.
         ticks = np.arange(self._last_ticks[i], self._ticks[i])
         times_ns: IntArray = ticks * NS_PER_S // self._rates_hz[i]
         return times_ns
 
     def read_records(self, i: int, columns: slice, runs: slice) -> Array:
-        """Returns results of the control periods that the last call of `step_to` executed.
+        """Returns results of the control periods executed in the last call of `step_to`.
 
         Args:
-            i: Index of the site (arm controller).
-            columns: Selects the numbers of a tick's record (result of a control period), see
-                `Layout.columns`.
-            runs: Selects the runs. Run 0 is the run itself, and the others are its twins.
+            i: Index of the site.
+            columns: Columns of the tick's record to return, see `Layout.columns`.
+            runs: Runs to return. Run 0 is the run itself, and the others are its twins.
 
         Returns:
-            The numbers, shape (ticks, columns, runs).
+            The values, shape (ticks, columns, runs).
         """
         pages = np.arange(self._last_ticks[i], self._ticks[i]) % self._records.shape[1]
         records: Array = self._records[i, :, columns, runs].view(np.float64)[pages]
@@ -182,8 +176,8 @@ class TwinLanes(LaneRun):
 class _LaneTwin:
     """A run or a slightly displaced copy of it (twin), simulated side by side with others.
 
-    The class has the methods of `CompiledRun` that are needed to measure the growth of the
-    displacement, so callers need not know how the runs are simulated.
+    It provides the methods of `CompiledRun` that are needed to measure how the displacement
+    grows. Callers therefore do not need to know how the runs are simulated.
 
     Args:
         lanes: The run and its twins.
@@ -198,22 +192,22 @@ class _LaneTwin:
         self._lane = lane
 
     def copy_state(self, other: "_LaneTwin") -> None:
-        """Makes this run continue from exactly the same state as another run.
+        """Overwrites the state of this run with an exact copy of the state of another run.
 
-        The other run must belong to the same simulation. Both runs then give the same results,
-        until one of them is displaced.
+        The other run must belong to the same simulation. Both runs then produce the same
+        results until one of them is displaced.
         """
         self.scale_difference(other, 0.0)
 
     def scale_difference(self, other: "_LaneTwin", factor: float) -> None:
         """Multiplies the difference between the states of this run and another run by a factor.
 
-        Every floating-point number x of the state becomes x_other + factor (x - x_other), as in
-        `CompiledRun.scale_difference`. This includes the states that are in transit.
+        Every floating-point value x of the state becomes x_other + factor (x - x_other), as in
+        `CompiledRun.scale_difference`. This includes states in transit.
 
         Args:
-            other: The other run that is simulated together with this one.
-            factor: The factor.
+            other: The other run, simulated together with this one.
+            factor: Scale factor.
         """
         lanes = self._lanes
         for table, is_float in lanes._changing:
@@ -226,8 +220,8 @@ class _LaneTwin:
     def displace(self, field: str, offsets: Array) -> None:
         """Adds small offsets to one field of the state of all sites, such as the angles "q".
 
-        The measured growth of the resulting difference shows whether the system is stable. For
-        the shape of the offsets see `CompiledRun.displace`.
+        Stability is judged by how the resulting difference grows. For the shape of the offsets,
+        see `CompiledRun.displace`.
         """
         columns = self._find_columns(field)
         field_words = slice(columns.start, columns.start + offsets.shape[1])
@@ -236,30 +230,30 @@ class _LaneTwin:
     def measure_distance(self, other: "_LaneTwin", field: str) -> float:
         """Returns the largest absolute difference of one field, such as "q", between two runs.
 
-        For the fields and units see `CompiledRun.measure_distance`.
+        For the fields and their units, see `CompiledRun.measure_distance`.
         """
         numbers = self._lanes._site.view(np.float64)[:, self._find_columns(field)]
         difference = numbers[:, :, self._lane] - numbers[:, :, other._lane]
         return float(np.abs(difference).max())
 
     def _find_columns(self, field: str) -> slice:
-        """Returns the indices of a field's numbers among all numbers of a site's row."""
+        """Returns the indices of a field's values among all values of a site's row."""
         fields: Any = self._lanes._layout.site.fields
         dtype, offset, *_ = fields[field]
         return slice(offset // 8, (offset + dtype.itemsize) // 8)
 
 
 def _scale(mine: Words, others: Words, is_float: NDArray[np.bool_], factor: float) -> None:
-    """Moves the numbers of one run closer to those of another run, or away from them.
+    """Moves the state of one run closer to that of another run, or away from it.
 
-    Every floating-point number x becomes x_other + factor (x - x_other). All other numbers are
+    Every floating-point value x becomes x_other + factor (x - x_other). All other values are
     copied from the other run.
 
     Args:
-        mine: Numbers of the run that is changed, as integers with the same bits.
-        others: The same numbers of the other run.
-        is_float: True for the floating-point numbers.
-        factor: The factor.
+        mine: Values of the run to change, as integers with the same bits.
+        others: The same values from the other run.
+        is_float: True for the floating-point values.
+        factor: Scale factor.
     """
     bits = mine.copy()
     mine[:] = others

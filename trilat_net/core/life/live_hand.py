@@ -1,20 +1,21 @@
-"""Computes how a human or a program pulls an arm, from messages that arrive during a run.
+"""Computes how a person or program pulls an arm, based on messages received during a run.
 
-A person who drags an arm on a web page, or a program with a haptic device, sends messages with
-goals. Such an operator is called a live hand. A target moves towards the newest goal, and a
-simulated spring pulls the arm to the target. The force of the spring is multiplied by the grip,
-a number from 0 to 1.
+A person dragging an arm on a web page, or a program connected to a haptic device, sends
+messages with goals. Such an operator is called a live hand. A target moves towards the newest
+goal, and a simulated spring pulls the arm towards the target. The spring force is multiplied by
+the grip, a factor from 0 to 1.
 
 Rules:
 
-- A new hold starts with no force at the pose of the arm. The grip grows from 0 to 1 within
-  `GRIP_NS`. If the grip of an earlier hold has not faded yet, the new hold continues from it.
-- The target moves in a straight line to the newest goal. This takes a quarter more than the
-  time between the last two messages, so that the target does not stop if a message is late.
+- A new hold starts at the pose of the arm, with no force. The grip grows from 0 to 1 within
+  `GRIP_NS`. If the grip of an earlier hold has not yet faded, the new hold continues from that
+  grip.
+- The target moves in a straight line to the newest goal. The move takes 25 % longer than the
+  time between the last two messages, so a slightly late message does not make the target stop.
 - After a silence of `SILENCE_NS`, the target comes to rest and the grip fades to 0.
-- A goal that the arm cannot reach is moved to the nearest point that it can reach.
-- The acceleration and the speed of the target are limited. At the distance d from its goal, the
-  speed is at most
+- A goal out of reach is replaced by the nearest reachable point.
+- The acceleration and speed of the target are limited. At distance d from the goal, the speed
+  is at most
 
       v(d) = a h (D / (n + 1) + n / 2)                                                     (L1)
       D = d / (a h^2),    n = floor((sqrt(1 + 8 D) - 1) / 2)
@@ -25,10 +26,10 @@ Rules:
   back along the line, the overshoot is at most V^2 / (2 a) + V h / 2 at the speed limit V.
 
 Invariant:
-    - `HandRules.advance` contains all of these rules. Its result depends only on its stored
-      state and on the messages that were received before the control period.
-    - The result is stored in the record of each control period. Therefore a log repeats what
-      people did without their messages.
+    - `HandRules.advance` implements all of these rules. Its result depends only on the stored
+      state and on the messages received before the control period.
+    - The result is stored in the record of each control period, so a run can be repeated from
+      its log without the original messages.
 """
 
 import math
@@ -39,26 +40,29 @@ from ..step.jit import leaf
 from ..step.vectors import Array, Vector
 
 SILENCE_NS = 200_000_000
-"""A longer silence of the holder releases the arm."""
+"""Silence of the holder after which the arm is released, ns."""
 GRIP_NS = 100_000_000
-"""Time in which a grip grows from 0 to 1, and in which it fades from 1 to 0."""
+"""Time in which the grip grows from 0 to 1, or fades from 1 to 0, ns."""
 GLIDE_NS = 50_000_000
-"""Longest time of a glide to the goal, unless a limit of the target prolongs it."""
+"""Longest time for the target to reach a new goal, ns, unless a limit on its motion prolongs
+it.
+"""
 
 ANOTHER_HOLDS = "hand: another one holds the arm"
 OUT_OF_ORDER = "hand: out of order"
 TAKEN = "takes hold"
 RELEASED = "lets go"
 SILENT = "is silent: let go"
-"""Outcomes of a message or a silence: reasons to ignore a message, and changes of the holder.
+"""Outcomes of a message or of a silence: reasons for ignoring a message, and changes of the
+holder.
 """
 
 
 class HandReach(NamedTuple):
     """Region of the positions that an arm can reach: a spherical shell, a box, or both.
 
-    Goals outside are moved to its border, so that the arm is not pulled where it cannot go. The
-    region may be larger than what the arm can really reach.
+    Goals outside the region are moved to its border. The region may be larger than the actual
+    workspace of the arm.
 
     Attributes:
         centre: Centre of the shell, m. Empty if there is no shell.
@@ -77,8 +81,7 @@ class HandReach(NamedTuple):
     def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
         """Returns the reachable position nearest to a goal, or the goal if it is reachable.
 
-        The goal is first moved to the nearest point of the box, and then to the nearest point
-        of the spherical shell.
+        The goal is projected first onto the box, and then onto the spherical shell.
 
         Args:
             goal: The goal, rad or m.
@@ -106,11 +109,11 @@ class HandReach(NamedTuple):
 
 
 class HandRules(NamedTuple):
-    """Limits for a person or program that moves an arm during the run.
+    """Limits that apply to a person or program moving an arm during a run.
 
-    The person or program sends goals. A target moves smoothly to the newest goal, and the arm
-    is pulled to the target. In some cases the goal and the target are forces instead of
-    positions.
+    The person or program sends goals. A target moves smoothly towards the newest goal, and the
+    arm is pulled towards the target. In force mode, the goal and the target are forces instead
+    of positions.
 
     Attributes:
         size: Number of coordinates of a target, one per axis or one per joint.
@@ -121,7 +124,7 @@ class HandRules(NamedTuple):
         max_goal_norm: Largest norm of an accepted goal, m, rad or N.
         acceleration_limit: Largest acceleration of the target, m/s^2 or rad/s^2; inf for no
             limit.
-        reach: Region of the goals that the arm can reach.
+        reach: Region that contains the goals within reach of the arm.
     """
 
     size: int
@@ -133,7 +136,7 @@ class HandRules(NamedTuple):
     reach: "HandReach" = HandReach()
 
     def start(self) -> "HandStep":
-        """Returns the state and the action while nobody has moved the arm yet."""
+        """Returns the initial state and action, before anyone has moved the arm."""
         return HandStep(HandMemory(), HandInForce.list_empty(self.size))
 
     def advance(
@@ -145,16 +148,14 @@ class HandRules(NamedTuple):
     ) -> "HandStep":
         """Computes how a person or program pulls the arm in one control period.
 
-        The person or program sends goals. A target moves smoothly to the newest goal, and the
-        arm is pulled to the target. This function moves the target by one period, accepts the
-        messages, ends the hold of a sender that is silent for too long, and chooses the next
-        velocity of the target.
+        Moves the target by one period, processes the new messages, ends the hold of a sender
+        that has been silent for too long, and chooses the next velocity of the target.
 
         Args:
             memory: State after the previous period.
             t_ns: Nominal time of the period, ns since the start of the session.
-            commands: Messages received since the previous period, in order.
-            locate: Function that returns the present pose of the arm, in the coordinates of the
+            commands: Messages received since the previous period, in order of arrival.
+            locate: Function that returns the current pose of the arm, in the coordinates of the
                 target.
 
         Returns:
@@ -191,18 +192,17 @@ class HandRules(NamedTuple):
 
 
 class HandCommand(NamedTuple):
-    """Message by which a person or program moves an arm during the run.
+    """Message with which a person or program moves an arm during a run.
 
-    For example, a web page sends such a message for each movement of the mouse: who sends it,
-    where the arm is to be pulled, and whether the arm is still held.
+    A web page, for example, sends such a message whenever the mouse moves. The message states
+    who sends it, where the arm is to be pulled, and whether the arm is still held.
 
     Attributes:
         source: Identifies the sender, a random number above 0.
-        number: Counts the goals of the sender. If two messages have the same number, the goal
-            is unchanged.
+        number: Sequence number of the sender's goal. Messages with the same number contain the
+            same goal.
         grip: True if the sender holds the arm, False to release it.
-        target: The goal to which the sender pulls the arm, m or rad. If the sender pushes with
-            a force instead, this is the force, N.
+        target: Goal to which the sender pulls the arm, m or rad. In force mode, the force, N.
         sent_ns: Time of sending by the sender's clock, ns.
     """
 
@@ -214,24 +214,26 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """State of the pull of a person or program on an arm, stored between two control periods.
+    """State of a person's or program's hold on an arm, kept between two control periods.
 
-    It states who holds the arm, how firmly, and the motion of the target to which the arm is
-    pulled.
+    Contains who holds the arm, how firmly, and the motion of the target towards which the arm
+    is pulled.
 
     Attributes:
-        source: Sender that holds the arm. 0 if nobody holds it; an earlier grip may still be
-            fading.
-        number: Number of the newest accepted message; -1 without a message.
+        source: Sender that holds the arm. 0 if nobody holds it, although an earlier grip may
+            still be fading.
+        number: Sequence number of the newest accepted message; -1 if there is none.
         grip: Firmness of the grip, 0 to 1.
         target: Position of the target, which the arm follows, m or rad, or the force, N.
         rate: Velocity of the target.
-        goal: Position to which the target moves, or the force.
-        arrives_ns: Time at which the target arrives at the goal, ns since the epoch, the common
-            start of the session.
-        sent_ns: Time of sending of the goal's message, ns.
-        received_ns: Time of the tick that accepted the newest message, ns since the epoch.
-        before: The last sender that released the arm, and the number of its last message.
+        goal: Position towards which the target moves, or the force.
+        arrives_ns: Time at which the target reaches the goal, ns since the start of the
+            session.
+        sent_ns: Time at which the goal's message was sent, ns.
+        received_ns: Time of the tick that accepted the newest message, ns since the start of
+            the session.
+        before: The last sender that released the arm, and the sequence number of its last
+            message.
     """
 
     source: int = 0
@@ -247,16 +249,16 @@ class HandMemory(NamedTuple):
 
 
 class HandInForce(NamedTuple):
-    """How a person or program pulls an arm in one control period, as stored in a log.
+    """How a person or program pulls an arm in one tick, as stored in a log.
 
-    A record of the log has these numbers in its field `hand`, in the order of the attributes.
-    With them, a run can be repeated without the person. Control periods are called ticks.
+    The field `hand` of a log record contains these attributes as numbers, in the order listed
+    here. They allow the run to be repeated without the person.
 
     Attributes:
         grip: Firmness of the grip, 0 to 1.
-        number: Number of the newest message that is obeyed. -1 if nobody holds the arm.
-        source: Sender that holds the arm. 0 if nobody holds it.
-        target: Position that the arm follows, m or rad, or the force, N, in the tick.
+        number: Sequence number of the message in effect; -1 if nobody holds the arm.
+        source: Sender that holds the arm; 0 if nobody holds it.
+        target: Position that the arm follows in this tick, m or rad, or the force, N.
         rate: Velocity of the target.
     """
 
@@ -268,11 +270,11 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Reads how a person or program pulled an arm in one control period, from a log.
+        """Reads how a person or program pulled an arm in one tick, from a log record.
 
         Args:
-            vector: Field `hand` of the record. It contains the numbers of all fields of this
-                class, in their order.
+            vector: Field `hand` of the record, which contains the attributes of this class in
+                the order of their definition.
         """
         grip, number, source, *numbers = vector
         size = len(numbers) // 2  # of the target and of its velocity
@@ -286,38 +288,36 @@ class HandInForce(NamedTuple):
 
     @staticmethod
     def count_numbers(size: int) -> int:
-        """Returns how many values the log stores about a person or program that moves the arm.
+        """Returns the length of the field `hand` of a record.
 
-        They are the fields of a `HandInForce` for one control period, written one after another
-        into the field `hand` of a record. Vectors such as the goal have `size` numbers.
+        The field holds the attributes of a `HandInForce` one after another. Each vector among
+        them, such as the target, has `size` entries.
 
         Args:
-            size: Number of coordinates of the target to which the arm is pulled.
+            size: Number of coordinates of the target towards which the arm is pulled.
         """
         return 3 + 2 * size
 
     @staticmethod
     def list_empty(size: int) -> list[float]:
-        """Returns the field `hand` of a record while no person or program moves the arm.
+        """Returns the field `hand` of a record for a tick in which nobody moves the arm.
 
         Args:
-            size: Number of coordinates of the target to which a holder would pull the arm.
+            size: Number of coordinates of the target towards which a holder would pull the arm.
         """
         return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
 
 class HandStep(NamedTuple):
-    """Result of one control period for the person or program that moves an arm.
-
-    It contains the new state, and the numbers that the log stores.
+    """Result of one control period for a person or program that moves an arm.
 
     Attributes:
         memory: State for the next period.
-        vector: Grip, target and velocity of the target in this period, in the form of
-            `HandInForce`.
-        refused: For each message that had no effect, the reason.
-        changes: Who took hold of the arm or left it, in order. Each entry contains the sender
-            of the messages, and TAKEN, RELEASED or SILENT (no message for too long).
+        vector: Grip, target and target velocity in this period, as the log stores them (see
+            `HandInForce`).
+        refused: The reason for each message that had no effect.
+        changes: Senders that took hold of the arm or released it, in order. Each entry contains
+            the sender and TAKEN, RELEASED or SILENT (no message for too long).
     """
 
     memory: HandMemory
@@ -327,15 +327,15 @@ class HandStep(NamedTuple):
 
 
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
-    """Returns the state one period later, with the target moved and the grip firmer or weaker.
+    """Returns the state one tick later, with the target moved and the grip updated.
 
-    The target moves with its velocity `rate`. The grip, a factor of the force from 0 to 1,
-    grows while a sender holds the arm, and fades after that. It needs GRIP_NS for the whole
-    range. When it has faded, nobody holds the arm, and no target is left.
+    The target moves at its velocity `rate`. The grip, a factor of the force from 0 to 1, grows
+    while a sender holds the arm and fades afterwards, taking GRIP_NS for the full range. Once
+    the grip has faded to 0, there is no holder and no target.
 
     Args:
         rules: Limits of the hand, and the rate of the control loop.
-        memory: State after the previous tick (period of the loop), with a target.
+        memory: State after the previous tick, with a target.
     """
     h_s = 1.0 / rules.rate_hz
     # The period, 1e9 / rate_hz in ns, as a fraction of GRIP_NS.
@@ -358,11 +358,11 @@ def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
 def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> float:
     """Returns the largest speed from which a target can stop within a distance, Eq. (L1).
 
-    The target moves in steps of one period h, with an acceleration of at most a. With a h as
-    the unit of speed and a h^2 as the unit of distance, the speed falls by 1 per period, and
-    the distance to the goal is D. From an integer speed n, the target can stop in n more
-    periods, which takes the distance n (n + 1) / 2. Therefore n is the largest integer with n
-    (n + 1) / 2 <= D. The remaining distance is divided among the n + 1 periods:
+    The target moves in steps of one period h, with an acceleration of at most a. Speeds are
+    measured in units of a h and distances in units of a h^2, so that the speed falls by 1 per
+    period and the distance to the goal is D. From an integer speed n, the target stops in n
+    more periods and travels n (n + 1) / 2. Therefore n is the largest integer with n (n + 1) /
+    2 <= D. The remaining distance is divided among the n + 1 periods:
 
         speed = n + (D - n (n + 1) / 2) / (n + 1) = D / (n + 1) + n / 2
 
@@ -382,10 +382,10 @@ def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> flo
 
 @leaf
 def find_glide_ns(between_messages_ns: int, rate_hz: int) -> int:
-    """Returns the time that the target of a pulled arm takes to reach a new goal, ns.
+    """Returns how long the target of a pulled arm takes to reach a new goal, ns.
 
-    The target is the point to which a person or program pulls the arm. It arrives when the next
-    message is expected, so that it moves evenly instead of jumping with each message.
+    The target (the point towards which the arm is pulled) arrives about when the next message
+    is expected. It therefore moves smoothly and does not jump with each message.
 
     Args:
         between_messages_ns: Time from the previous message to the new message, ns.
@@ -399,7 +399,7 @@ def find_glide_ns(between_messages_ns: int, rate_hz: int) -> int:
 
 _plain_glide_ns = getattr(find_glide_ns, "py_func", find_glide_ns)
 _plain_stopping_speed = getattr(find_stopping_speed, "py_func", find_stopping_speed)
-"""The same functions, uncompiled: a call from Python into compiled code takes longer than these
+"""The uncompiled functions. A call from Python into compiled code would take longer than these
 few operations.
 """
 
@@ -419,27 +419,27 @@ def glide(
 ) -> float:
     """Computes how a person or program pulls an arm in several ticks without a new message.
 
-    A simulated spring pulls the arm to a target, which moves to the goal of the last message.
-    The grip, a factor of the force from 0 to 1, grows initially. The result equals that of
-    `HandRules.advance`, bit for bit, but one compiled call computes all ticks (control
-    periods).
+    A simulated spring pulls the arm towards a target, which moves to the goal of the last
+    message. The grip, a factor of the force from 0 to 1, grows initially. The results are
+    bit-identical to those of `HandRules.advance`, but a single compiled call computes all
+    ticks.
 
     Args:
         first: The first tick.
         rate_hz: Tick rate of the site, Hz.
-        grip: Firmness of the grip before, 0 to 1.
-        arrives_ns: Time at which the target arrives at the goal, ns since the start of the
+        grip: Initial firmness of the grip, 0 to 1.
+        arrives_ns: Time at which the target reaches the goal, ns since the start of the
             session.
         speed_limit: Largest speed of the target, m/s or rad/s.
-        acceleration: Largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
+        acceleration: Largest acceleration of the target, m/s^2 or rad/s^2; inf for no limit.
         goal: The goal, shape (size,).
-        target: The target before; changed, shape (size,).
-        rate: Its velocity before; changed, shape (size,).
-        rows: Receives one row per tick, in the form of `HandInForce`. The number and the
-            source of the message (columns 1 and 2) are left to the caller.
+        target: The initial target; modified, shape (size,).
+        rate: The initial velocity of the target; modified, shape (size,).
+        rows: Receives one row per tick, in the form of `HandInForce`. The caller fills in the
+            number and the source of the message (columns 1 and 2).
 
     Returns:
-        The firmness of the grip afterwards.
+        The firmness of the grip after the last tick.
     """
     h_s = 1.0 / rate_hz
     # The period, 1e9 / rate_hz in ns, as a fraction of GRIP_NS.
@@ -489,17 +489,16 @@ def _glide_tick(
 ) -> None:
     """Moves a target towards its goal in one control period, with limited acceleration.
 
-    A simulated spring pulls the arm to this target. The equations of the velocity are those of
-    `_find_limited_rate`, for compiled code.
+    Compiled equivalent of `_find_limited_rate`.
 
     Args:
-        left_s: Time that remains until the target arrives at the goal, s.
-        h_s: The period, s.
+        left_s: Time remaining until the target should reach the goal, s.
+        h_s: The control period, s.
         speed_limit: Largest speed of the target, m/s or rad/s.
         acceleration: Largest acceleration of the target, m/s^2 or rad/s^2.
         goal: The goal, shape (size,).
-        target: The target; changed, shape (size,).
-        rate: Its velocity; changed, shape (size,).
+        target: The target; modified, shape (size,).
+        rate: Velocity of the target; modified, shape (size,).
     """
     size = target.shape[0]
     square = 0.0
@@ -531,21 +530,21 @@ def _accept_command(
     command: HandCommand,
     locate: Callable[[], Sequence[float]],
 ) -> tuple[HandMemory, str]:
-    """Processes a message of a person or program that holds an arm, or wants to.
+    """Processes a message from a person or program that holds an arm, or tries to.
 
-    Only one sender holds an arm at a time. A message may take hold of a free arm, move the goal
-    to which the arm is pulled, or release the arm.
+    Only one sender can hold an arm at a time. A message may take hold of a free arm, move the
+    goal, or release the arm.
 
     Args:
         rules: Limits of the goals.
         memory: State before the message.
-        t_ns: Nominal time of the tick (control period), ns since the start of the session.
+        t_ns: Nominal time of the tick, ns since the start of the session.
         command: The message.
-        locate: Function that returns the arm's pose now.
+        locate: Function that returns the current pose of the arm.
 
     Returns:
-        The state after the message, and the outcome: a reason why the message has no effect, a
-        change of the holder, or "" for an ordinary message.
+        The state after the message, and the outcome: the reason why the message has no effect,
+            a change of the holder, or "" for an ordinary message.
     """
     is_held = memory.source != 0
     if is_held and memory.source != command.source:
@@ -586,24 +585,21 @@ def _take_hold(
     command: HandCommand,
     locate: Callable[[], Sequence[float]],
 ) -> HandMemory:
-    """Returns the state after a message by which a sender takes hold of a free arm.
+    """Returns the state after a sender has taken hold of a free arm.
 
-    A simulated spring pulls the arm to a target, which moves to the goal of the message. The
-    grip is the factor of the spring's force, 0 to 1. While the grip of an earlier hold fades,
-    its target still exists and moves. The new hold then continues with this grip, target and
-    velocity, so that the force does not jump. Otherwise it starts without force, at the pose of
-    the arm.
+    While the grip of an earlier hold fades, its target still exists and moves. A new hold then
+    continues with this grip, target and velocity, so that the force does not jump. Otherwise
+    the hold starts at the pose of the arm, with no force.
 
     Args:
         rules: Limits of the hand.
-        memory: State before the message. Nobody holds the arm.
-        t_ns: Nominal time of the tick (control period), ns since the epoch, the common start of
-            the session.
+        memory: State before the message, in which nobody holds the arm.
+        t_ns: Nominal time of the tick, ns since the start of the session.
         command: The message.
-        locate: Function that returns the arm's pose now.
+        locate: Function that returns the current pose of the arm.
 
     Returns:
-        The state. The target arrives at its goal after GLIDE_NS.
+        The new state. The target reaches its goal after GLIDE_NS.
     """
     zeros = (0.0,) * rules.size
     is_earlier_grip_fading = bool(memory.target)
@@ -629,15 +625,15 @@ def _take_hold(
 def _aim(
     rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int
 ) -> HandMemory:
-    """Returns the state of a pulled arm with the goal of a new message.
+    """Returns the state after the goal has been set from a new message.
 
-    A goal that the arm cannot reach is moved to the nearest point that it can reach.
+    A goal out of reach is replaced by the nearest reachable point.
 
     Args:
         rules: Limits of the hand.
         memory: State before the message.
         command: The message.
-        arrives_ns: Time at which the target arrives at the goal, ns since the start of the
+        arrives_ns: Time at which the target should reach the goal, ns since the start of the
             session.
     """
     goal = rules.reach.find_nearest(command.target)
@@ -649,30 +645,28 @@ def _aim(
 def _release(memory: HandMemory, number: int) -> HandMemory:
     """Returns the state after a person or program has let go of the arm.
 
-    Nobody holds the arm, but the grip, the target and its velocity continue, so that the force
-    fades without a jump.
+    The grip, the target and its velocity are kept, so that the force fades smoothly.
 
     Args:
         memory: State before the release.
-        number: Messages of the former holder up to this number are outdated. They do not take
-            hold of the arm again.
+        number: Messages of the former holder up to this sequence number are outdated, and
+            cannot take hold of the arm again.
     """
     before = (memory.source, number)
     return HandMemory(grip=memory.grip, target=memory.target, rate=memory.rate, before=before)
 
 
 def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
-    """Returns the velocity of the target after the person has let go of the arm.
+    """Returns the velocity of the target while the grip fades after a release.
 
-    The force that pulls the arm to the target fades meanwhile. The speed of the target falls
-    with the largest deceleration that `rules` allow, until the target stands still.
+    The target decelerates as fast as `rules` allow until it stands still.
 
     Args:
         rules: Limits of the target's motion, and the rate of the control loop.
-        memory: State of the pull, with the present velocity of the target.
+        memory: State of the hand, with the current velocity of the target.
 
     Returns:
-        The velocity, one number per coordinate, in the unit of the target per second.
+        The velocity, one entry per coordinate, in the unit of the target per second.
     """
     speed = math.sqrt(sum(v * v for v in memory.rate))
     largest_change = rules.acceleration_limit / rules.rate_hz
@@ -687,22 +681,20 @@ def _find_limited_rate(
 ) -> tuple[float, ...]:
     """Returns the velocity with which a target moves towards its goal and stops there.
 
-    A simulated spring pulls an arm to this target. Speed and acceleration are limited.
+    Speed and acceleration are limited. The desired velocity points to the goal. Its magnitude
+    is the smallest of three speeds: the speed limit, the speed that reaches the goal in the
+    remaining time, and the largest speed from which the target can stop at the goal, Eq. (L1)
+    of the module docstring. The velocity changes linearly towards the desired velocity, by at
+    most the acceleration limit times the control period.
 
-    The desired velocity points to the goal. Its size is the smallest of three speeds: the speed
-    limit, the speed that reaches the goal in the time that is left, and the largest speed from
-    which the target can stop at the goal, Eq. (L1) at the top of this module. The velocity
-    changes from the last to the desired velocity in a straight line, by at most the
-    acceleration limit times the period.
-
-    The norms of velocities and accelerations are limited. The last and the desired velocity
-    lie within the speed limit, and so does any velocity between them.
+    The limits apply to the norms. The previous and the desired velocity are both within the
+    speed limit, and so is any velocity between them.
 
     Args:
-        rules: The limits of the hand.
-        memory: Its state, with the target already moved, the goal, and the last velocity
-            `rate`, m/s or rad/s.
-        left_s: Time that remains until the target arrives at the goal, s.
+        rules: Limits of the hand.
+        memory: State of the hand, with the target already moved, the goal, and the previous
+            velocity `rate`, m/s or rad/s.
+        left_s: Time remaining until the target should reach the goal, s.
 
     Returns:
         The velocity of the target, m/s or rad/s per coordinate.
@@ -733,17 +725,17 @@ def _find_limited_rate(
 def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
     """Returns the velocity with which a target moves towards its goal.
 
-    A simulated spring pulls an arm to this target. It moves straight, and arrives when the next
-    message with a new goal is expected, unless this needs more than the largest speed. If the
-    acceleration is limited, it also slows down in time.
+    The target moves in a straight line, and arrives when the next message with a new goal is
+    expected, unless this would exceed the speed limit. If the acceleration is limited, the
+    target also decelerates in time.
 
     Args:
         rules: Limits of the target's motion, and the rate of the control loop.
-        memory: State, with the target already moved to this tick.
-        t_ns: Nominal time of the tick (control period), ns since the start of the session.
+        memory: State of the hand, with the target already moved to this tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
 
     Returns:
-        The velocity, one number per coordinate, in the unit of the target per second.
+        The velocity, one entry per coordinate, in the unit of the target per second.
     """
     # An overdue target arrives within one period.
     period_s = 1.0 / rules.rate_hz

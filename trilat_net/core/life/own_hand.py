@@ -1,15 +1,15 @@
-"""Lets a user's program move an arm, as a human operator would.
+"""Lets a user's program move an arm in place of a human operator.
 
-The program is a class with a method `act`. At a fixed rate it receives a `HandView`: what the
-control process of the arm knows at that time, such as joint angles and forces. It returns a
-target towards which the arm is pulled, or a force on the arm. A learned policy or a model of a
-human can thus operate a master arm.
+The program is a class with a method `act`. At a fixed rate, `act` receives a `HandView` with
+the data available at the site, such as joint angles and forces, and returns a target towards
+which the arm is pulled, or a force on the arm. This allows a learned policy or a model of a
+human to operate a master arm.
 
 Invariant:
-    - A decision that is based on tick k (a period of the control loop) acts a fixed time after
-      tick k, wherever the program runs. A decision that arrives later than this acts at once.
-    - The action is an input of the tick and is stored with it, so a log repeats the action
-      without the program.
+    - A decision based on tick k takes effect a fixed time after tick k, wherever the program
+      runs. A decision that arrives later takes effect at once.
+    - The action is an input of the tick and is stored with it, so a run can be repeated from
+      its log without the program.
 """
 
 import math
@@ -35,7 +35,7 @@ from .live_hand import (
 )
 
 PROGRAM = 1
-"""The source that a record names for each action of a hand program."""
+"""Source recorded for each action of a hand program."""
 
 
 class HandContext(NamedTuple):
@@ -48,14 +48,14 @@ class HandContext(NamedTuple):
     ...         return [0.0] * self.size
 
     Attributes:
-        site: Site whose arm the program holds.
+        site: Name of the site whose arm the program moves.
         peers: Names of the peers, in scenario order.
-        mode: "tip": the program moves the end effector; "joint": it turns the joints; "force":
-            it pushes.
+        mode: "tip" if the program moves the end effector, "joint" if it moves the joints,
+            "force" if it applies a force.
         size: Number of components of an action: one per axis, m or N, or one per joint, rad.
         rate_hz: Rate of decisions, Hz.
-        delay_s: Time from a view to the action that is based on it, s.
-        speed_limit: Largest speed of the target, m/s or rad/s; inf for a program that pushes.
+        delay_s: Time from a view to the action based on it, s.
+        speed_limit: Largest speed of the target, m/s or rad/s; inf in force mode.
         limit: Largest force, N, or largest norm of the torques, N m.
         seed: Seed for random numbers, derived from the scenario and the site.
     """
@@ -72,7 +72,7 @@ class HandContext(NamedTuple):
 
 
 class HandView(NamedTuple):
-    """Information that a user's program gets when it decides how to move an arm.
+    """Data that a user's program receives for each decision about an arm.
 
     >>> def act(self, now: tn.HandView) -> list[float]:
     ...     return now.pose + 0.3 * (self.goal_m - now.pose)
@@ -82,16 +82,15 @@ class HandView(NamedTuple):
         t_s: Nominal time of the tick since the start of the session, s.
         q: Joint angles of the arm, rad, shape (n,).
         qd: Joint velocities, rad/s.
-        pose: Pose of the arm in the coordinates of the hand: its end effector, m, or its
-            joints, rad.
-        q_des: The reference of the previous tick, rad or m, shape (m,).
-        tau_x: Exogenous torque of the previous tick, N m; the torque ON the arm is its
-            negative.
-        target: The hand's current target, m or rad, or its force, N; zeros while it does not
-            hold the arm.
+        pose: Pose of the arm in the coordinates of the hand: end effector position, m, or joint
+            angles, rad.
+        q_des: Reference of the previous tick, rad or m, shape (m,).
+        tau_x: External torque of the previous tick, N m; the torque ON the arm is its negative.
+        target: Current target of the hand, m or rad, or its force, N; zeros while the hand does
+            not hold the arm.
         grip: Firmness of the hand's grip, 0 to 1.
-        peers: The peers in scenario order, with the samples that were in use at the previous
-            tick. q and qd have shape (m,), and the ages are those at this tick.
+        peers: The peers in scenario order, with the samples in use at the previous tick. q and
+            qd have shape (m,). The ages refer to this tick.
     """
 
     k: int
@@ -107,38 +106,38 @@ class HandView(NamedTuple):
 
 
 class HandProgram(Protocol):
-    """Interface of a user's program that moves an arm as a human operator would.
+    """Interface of a user's program that moves an arm in place of a human operator.
 
-    The class of the program is called with two kinds of arguments: a `HandContext`, and the
-    settings of the program as keyword arguments.
+    The class is instantiated with a `HandContext` and with the program's settings as keyword
+    arguments.
     """
 
     def act(self, now: HandView) -> Sequence[float] | None:
-        """Decides where the program pulls the arm, given what it may know at this moment.
+        """Decides where to pull the arm, given the data available at this moment.
 
-        The program is called at regular times, for example 50 times a second.
+        Called at regular intervals, for example 50 times per second.
 
         Args:
-            now: State of the arm, of the target to which it is pulled, and of the other arms.
+            now: State of the arm, of the target towards which it is pulled, and of the other
+                arms.
 
         Returns:
-            The target of the end effector, m, or of the joints, rad, or a force, N, depending
-            on the program's mode. `None` if the program releases the arm.
+            Depending on the mode, the target of the end effector, m, the target of the joints,
+            rad, or a force, N. `None` releases the arm.
         """
 
 
 class OwnHand:
-    """Runs a user's program that moves an arm during a simulation or a live session.
+    """Runs a user's program that moves an arm in a simulation or a live session.
 
-    At regular times, the program gets a view of what the site (the process that runs the arm)
-    knows, and decides where to pull the arm. The decision acts after a delay, like the reaction
-    time of a person.
+    At regular intervals, the program receives a view of the site's data and decides where to
+    pull the arm. The decision takes effect after a delay, similar to the reaction time of a
+    person.
 
     Args:
-        rules: Limits of the program's actions.
-        period_ticks: Time from one decision to the next, in periods of the control loop.
-        delay_ticks: Time from a view to the start of the action that is based on it, in periods
-            of the control loop.
+        rules: Limits on the program's actions.
+        period_ticks: Time between decisions, in ticks.
+        delay_ticks: Time from a view until the action based on it takes effect, in ticks.
         locate: Function that computes the pose of the arm from its joint angles, in the
             coordinates in which the program acts.
     """
@@ -162,28 +161,27 @@ class OwnHand:
         """Returns True if the user's program makes a decision in tick k.
 
         This is every `period_ticks`-th tick: 0, 20, 40 and so on for a program that decides 50
-        times a second in a loop of 1 kHz.
+        times per second at a tick rate of 1 kHz.
         """
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
-        """Returns the first control period after `k` in which the program changes anything.
+        """Returns the next tick after `k` in which a decision is made or takes effect.
 
-        In this period the program decides, or an earlier decision takes effect. Until then
-        `advance_span` computes all periods in one compiled call.
+        All ticks before that can be computed by one compiled call of `advance_span`.
         """
         next_decision = (k // self.period_ticks + 1) * self.period_ticks
         next_actions = [due for due, _ in self._due if due > k]
         return min([next_decision, *next_actions])
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
-        """Collects what the user's program may know when it decides how to pull the arm.
+        """Collects the data that the user's program may use for its decision.
 
-        This is the state of its own arm, and the newest states that other arms have sent.
+        These are the state of its own arm and the newest states received from other arms.
 
         Args:
-            k: Control period of the decision. Its results have not been computed yet.
-            arrays: State of the site (the process that runs the arm) after the previous period.
+            k: Tick of the decision, whose results have not been computed yet.
+            arrays: State of the site after the previous tick.
             layout: Lengths of the site's vectors.
         """
         # NumPy reads fields of plain arrays faster than those of records.
@@ -210,13 +208,12 @@ class OwnHand:
         )
 
     def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
-        """Returns what the user's program may know about the other arms.
+        """Returns the data about the other arms that the user's program may use.
 
-        The program sees the states of the other arms that this arm used in the previous control
-        period, after their network delay.
+        These are the delayed states of the other arms that this arm used in the previous tick.
 
         Args:
-            k: Number of the tick (control period) of the decision.
+            k: Number of the tick of the decision.
             links: State of each link, one row per peer.
             coordinates: Number of coordinates of a sample.
         """
@@ -247,15 +244,14 @@ class OwnHand:
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Checks a decision of the user's program, and schedules it after a reaction time.
+        """Checks a decision of the user's program, and schedules it after the reaction time.
 
-        A decision is ignored if a decision based on a newer view of the arm was accepted
-        before.
+        The decision is ignored if a decision based on a newer view has already been accepted.
 
         Args:
-            k: Control period of the view of the arm on which the decision is based.
-            goal: Position to which the program pulls the arm, m or rad, or the force, N. If
-                None, the program releases the arm.
+            k: Tick of the view on which the decision is based.
+            goal: Position towards which the program pulls the arm, m or rad, or the force, N.
+                None releases the arm.
 
         Raises:
             ValueError: The goal has the wrong number of coordinates, is not finite, or is too
@@ -284,21 +280,21 @@ class OwnHand:
         self._schedule(k, k + self.delay_ticks, numbers, grip=holds_arm)
 
     def release(self, k: int) -> None:
-        """Makes the program release the arm in control period k.
+        """Makes the program release the arm in tick k.
 
-        All earlier decisions of the program that have not yet taken effect are cancelled.
+        Decisions that have not yet taken effect are cancelled.
         """
         self._due.clear()
         self._schedule(k, k, (), grip=False)
 
     def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
-        """Stores a decision of the user's program until the tick (period) in which it acts.
+        """Stores a decision of the user's program until the tick in which it takes effect.
 
-        The wait imitates the reaction time of a person.
+        The delay imitates the reaction time of a person.
 
         Args:
-            k: Tick of the view on which the command is based.
-            due: Tick in which the command acts.
+            k: Tick of the view on which the decision is based.
+            due: Tick in which the decision takes effect.
             target: Target or force; empty if the arm is released.
             grip: True if the program holds the arm.
         """
@@ -312,18 +308,17 @@ class OwnHand:
         self._due.append((due, command))
 
     def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Computes how the user's program pulls the arm in control period k.
+        """Computes how the user's program pulls the arm in tick k.
 
-        Decisions whose reaction time has passed take effect. Then the point to which the arm is
-        pulled advances by one period.
+        Decisions whose reaction time has passed take effect. Then the target of the hand
+        advances by one tick.
 
         Args:
-            k: Number of the control period. It must follow the period of the previous call.
+            k: Number of the tick, which must directly follow the tick of the previous call.
             read_angles: Function that returns the joint angles, rad.
 
         Returns:
-            The action in this period and the state for the next period, see
-            `HandRules.advance`.
+            The action in this tick and the state for the next tick. See `HandRules.advance`.
         """
         # The commands whose delay has passed, in order.
         commands = []
@@ -345,19 +340,18 @@ class OwnHand:
     def advance_span(
         self, k: int, end: int, read_angles: Callable[[], Sequence[float]]
     ) -> Array:
-        """Computes how the program pulls the arm in several control periods at once.
+        """Computes how the program pulls the arm over several ticks in one compiled call.
 
-        One compiled call computes the span of periods. It ends before the next period in which
-        the program makes a decision or a decision starts to act. The results are exactly those
-        of repeated calls of `advance_to`.
+        The span ends before the next tick in which the program decides or a decision takes
+        effect. The results are identical to those of repeated calls of `advance_to`.
 
         Args:
-            k: The first control period.
-            end: The span ends before this period at the latest.
-            read_angles: Function that returns the joint angles in period k, rad.
+            k: The first tick.
+            end: Upper bound of the span, exclusive.
+            read_angles: Function that returns the joint angles in tick k, rad.
 
         Returns:
-            One row per period, in the form of `HandInForce`.
+            One row per tick, in the form of `HandInForce`.
         """
         size = self._rules.size
         rate_hz = self._rules.rate_hz

@@ -1,42 +1,41 @@
-"""Brings an arm to rest where it is, and keeps it there.
+"""Brings an arm to rest at its current position and holds it there.
 
-An arm rests while its site (the process that runs the arm) waits for other sites, is stopped,
-or has a fault. Each joint follows a reference, the position q_ref with the velocity qd_ref,
-which slows down smoothly to zero.
+An arm rests while its site waits for other sites, is stopped, or has a fault. Each joint
+follows a reference (position q_ref, velocity qd_ref) that slows down smoothly to zero.
 
-Reference: It starts at the angle q and the velocity qd of the joint. In each period h of the
-control loop, its speed falls by the factor
+Reference: The reference starts at the angle q and the velocity qd of the joint. In each control
+period h, its speed is multiplied by
 
     1 - h / T_left,    T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i)
 
-where t is the time since the start, in s, and a_i the deceleration that half of the torque
-limit of joint i gives. The reference is never faster than the joint, and stops when the joint
-reverses. While the arm is fast or a torque is at its limit, q_ref moves along with a joint that
-moves away from it.
+where t is the time since the start, in s, and a_i the deceleration of joint i at half of its
+torque limit. The reference is never faster than the joint, and stops when the joint reverses.
+While the arm is fast or a torque is at its limit, q_ref is carried along by a joint that moves
+away from it.
 
-Torque: The control law computes a torque for this reference. It is replaced by the known or
-estimated gravity torque if the law cannot be used, see `rests_by_law`. In both cases these
-terms are added:
+Torque: The control law computes a torque for this reference. If the law cannot be used (see
+`rests_by_law`), the known or estimated gravity torque takes its place. In both cases, two terms
+are added:
 
     w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    dw/dt = -k B s
 
 - B is the damping in N m s/rad, and k = 1 / (4 `RestGains.time_s`). Lambda is the convergence
   rate, in 1/s: the rate of the adaptive law in joint space, otherwise `REST_RATE_1_S`.
-- w carries a constant load, for example unknown gravity. It starts as the difference between
-  the last torque and the torque of the law for the rest reference, times
-  1 - max B |qd| / tau_limit. While the arm brakes, w loses B |qd| in each period in which it
-  acts in the direction of motion.
+- w is an integral term that supports a constant load, for example unknown gravity. Its initial
+  value is the difference between the last torque and the law's torque for the rest reference,
+  times 1 - max B |qd| / tau_limit. While the arm brakes, w is reduced by B |qd| in each period
+  in which it acts in the direction of motion.
 
-An arm is fast while B |qd| of some joint exceeds its torque limit `tau_limit`. The limit on the
-rate of the torque does not delay braking: against the motion, the torque may change by B |qd|
-more per period.
+An arm is fast while B |qd| of any joint exceeds its torque limit `tau_limit`. The torque rate
+limit does not delay braking: in the direction that opposes the motion, the torque may change by
+an additional B |qd| per period.
 
 Invariant:
     - The reference of a joint keeps its direction and never becomes faster.
-    - While an arm brakes, no term but w acts in the direction of motion, and w adds at most the
-      energy h w^2 / 2 B per period. docs/theory/coming-to-rest.md derives this.
-    - Once the reference rests and no torque is limited, the energy function of the adaptive law
-      in joint space plus 1/2 w' (k B)^-1 w never rises.
+    - While an arm brakes, only w can act in the direction of motion, and w adds at most the
+      energy h w^2 / 2 B per period (derived in docs/theory/coming-to-rest.md).
+    - Once the reference is at rest and no torque is limited, the sum of the adaptive law's
+      energy function in joint space and 1/2 w' (k B)^-1 w never increases.
 """
 
 from math import inf, isfinite
@@ -49,7 +48,7 @@ from ..step.ticks import NS_PER_S, LifeReason, Mode
 from ..step.vectors import Array
 
 REST_RATE_1_S = 3.0
-"""Lambda for an arm at rest, if its control law has no such rate for the joints, 1/s."""
+"""Lambda for a resting arm if its control law has no such rate for the joints, 1/s."""
 
 _ROUNDING_S = 1e-9
 """Tolerance for rounding errors in the time at which a reference comes to rest, s."""
@@ -67,11 +66,11 @@ _KNOWN = int(Law.KNOWN)
 
 @leaf
 def rests(site: SiteRow) -> bool:
-    """Returns True if the arm is being brought to rest, or is at rest already.
+    """Returns True if the arm is at rest or being brought to rest.
 
-    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the scenario
-    chose `StaleAction.GLIDE` for arms that fall silent. With other choices, these modes do not
-    stop the arm smoothly.
+    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, provided that the scenario
+    uses `StaleAction.GLIDE` for arms that fall silent. With other settings, these modes do not
+    bring the arm to rest smoothly.
     """
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
@@ -79,11 +78,11 @@ def rests(site: SiteRow) -> bool:
 
 @leaf
 def _find_brake_ratio(site: SiteRow) -> float:
-    """Returns how much of its largest torque an arm needs for braking by damping alone.
+    """Returns the fraction of the torque limit required for braking with damping alone.
 
-    This is the largest ratio of B |qd| to the torque limit over the joints, where B is the
-    damping with which the arm comes to rest, and qd the joint velocity. Above 1 the damping
-    alone needs more torque than a joint has.
+    This is the maximum of B |qd| / torque limit over all joints, where B is the damping with
+    which the arm comes to rest, and qd the joint velocity. If the ratio exceeds 1, damping
+    alone would require more torque than a joint can produce.
     """
     ratio = 0.0
     for i in range(site.joints):
@@ -94,10 +93,10 @@ def _find_brake_ratio(site: SiteRow) -> float:
 
 @leaf
 def _is_fast(site: SiteRow) -> bool:
-    """Returns True if an arm moves so fast that braking by damping exceeds a torque limit.
+    """Returns True if an arm moves so fast that damping would exceed a torque limit.
 
-    The damping of a joint needs the torque B |qd|, where B is the damping gain in N m s/rad and
-    qd the velocity of the joint. It suffices that one joint exceeds its limit.
+    Damping requires the torque B |qd|, where B is the damping gain in N m s/rad and qd the
+    joint velocity. A single joint that exceeds its limit is sufficient.
     """
     fast: bool = _find_brake_ratio(site) > 1.0
     return fast
@@ -107,14 +106,14 @@ def _is_fast(site: SiteRow) -> bool:
 def rests_by_law(site: SiteRow) -> bool:
     """Returns True if the control law can hold the arm at rest.
 
-    Otherwise the known or estimated gravity torque holds the arm, and the estimate of the
-    dynamic parameters is not updated. This is the case in any of these situations:
+    In the following cases, the known or estimated gravity torque holds the arm instead, and the
+    estimate of the dynamic parameters is not updated:
 
-    - The law was written by a user, and does not declare with `holds = True` that it works
+    - The law was written by a user and does not declare, with `holds = True`, that it works
       without the motion of other arms.
-    - The law works in task space, and is not the built-in law that knows the gravity torque.
-    - The law computed a number that is not finite.
-    - The arm is too fast, see `_is_fast`.
+    - The law works in task space and is not the built-in law with a known gravity torque.
+    - The law returned a value that is not finite.
+    - The arm is too fast (see `_is_fast`).
     """
     is_declared = site.law != _USER or site.holds != 0
     is_unsuitable_in_task = site.task != 0 and site.law != _KNOWN
@@ -126,16 +125,17 @@ def rests_by_law(site: SiteRow) -> bool:
 
 @leaf
 def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
-    """Begins to bring an arm to rest, for example because another arm has fallen silent.
+    """Starts bringing an arm to rest, for example because another arm has fallen silent.
 
-    The joints then follow a motion that slows down until they stand still, the rest reference.
-    An arm that rests already keeps its reference, unless its control law failed now or before.
+    The joints then follow the rest reference, which slows down until they stand still. An arm
+    that is already resting keeps its reference, unless its control law has failed, now or
+    earlier.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
+        t_ns: Time, ns since the start of the session.
         mode: The mode to enter.
-        reason: Reason of the change of mode, a `LifeReason`.
-        site: State of the site (the process that runs the arm); changed.
+        reason: Reason for the change of mode, a `LifeReason`.
+        site: State of the site; modified.
     """
     failed = reason == _NOT_FINITE or site.reason == _NOT_FINITE
     keeps_reference = rests(site) and not failed
@@ -152,7 +152,7 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
 def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
     """Returns the reference position and velocity of joint i while the arm comes to rest.
 
-    `_write_rest_reference` says why joint space and task space keep them in different fields.
+    `_write_rest_reference` explains why joint space and task space use different fields.
 
     Returns:
         The position, rad or m, and the velocity, rad/s or m/s.
@@ -164,15 +164,15 @@ def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
 
 @leaf
 def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
-    """Stores the rest reference of a joint, the motion that brings the joint to rest.
+    """Stores the rest reference of a joint, which brings the joint to rest.
 
-    In joint space, the sites share joint angles. The fields `q_held` and `qd_held` have one
-    number per joint, and no other use while the arm rests. In task space, the sites share poses
-    of the end effector. Then these fields have one number per coordinate of the pose, and the
-    joints need `q_rest` and `qd_rest`. `_read_rest_reference` reads the same fields.
+    In joint space, the fields `q_held` and `qd_held` have one entry per joint, and are
+    otherwise unused while the arm rests. In task space, they have one entry per coordinate of
+    the end effector pose, so the joints use `q_rest` and `qd_rest` instead.
+    `_read_rest_reference` reads the same fields.
 
     Args:
-        site: State of the site (the process that runs the arm); changed.
+        site: State of the site; modified.
         i: Index of the joint.
         q: Position of the reference, rad.
         qd: Velocity of the reference, rad/s.
@@ -187,15 +187,14 @@ def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
 
 @leaf
 def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
-    """Returns the time T_left that the arm still takes to come to rest, s.
+    """Returns the remaining time T_left until the arm comes to rest, s.
 
-    It is at least the part of LEAST_STOP_S that is left, and long enough for each joint to stop
-    with the deceleration that half of its torque limit gives.
+    T_left is at least the remainder of LEAST_STOP_S, and long enough for each joint to stop
+    with half of its torque limit.
 
     Args:
         elapsed_s: Time since the start of the rest, s.
-        site: State of the site (the process that runs the arm), with the velocity of the
-            reference.
+        site: State of the site, with the velocity of the reference.
     """
     remaining_s = LEAST_STOP_S - elapsed_s
     for i in range(site.joints):
@@ -206,16 +205,15 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
 @leaf
 def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
-    """Advances the motion that brings the joints of an arm to rest, by one or more periods.
+    """Advances the rest reference, which brings the joints of an arm to rest.
 
-    The joints follow this motion, which is called the rest reference. Its rules are at the top
-    of this module.
+    The rules of the reference are given in the module docstring.
 
     Args:
-        t_ns: Time of the present period of the control loop, ns since the start of the session.
-        ticks: Number of periods since the last call. It is more than 1 if the site (the process
-            that runs the arm) was too slow and missed periods.
-        site: State of the site; the reference is changed.
+        t_ns: Time of the current tick, ns since the start of the session.
+        ticks: Number of ticks since the last call, more than 1 if the site was too slow and
+            missed ticks.
+        site: State of the site; the reference is modified.
     """
     if t_ns == site.return_from_ns:
         return  # the reference starts in this tick
@@ -255,16 +253,15 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
 
 @leaf
 def _brakes(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the arm brakes, which is the first part of its rest.
+    """Returns True while the arm brakes, which is the first phase of coming to rest.
 
-    An arm at rest follows a reference, a position of each joint that slows down to zero
-    velocity. The arm brakes for at least LEAST_STOP_S, while the reference of a joint moves,
-    and while the arm is fast (its damping alone exceeds a torque limit).
+    The arm brakes for at least LEAST_STOP_S, and for as long as the rest reference of a joint
+    moves or the arm is fast (see `_is_fast`).
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm). While the arm is at rest,
-            `return_from_ns` is the start of the rest.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site. While the arm is at rest, `return_from_ns` is the start of the
+            rest.
     """
     elapsed_ns = t_ns - site.return_from_ns
     brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or _is_fast(site)
@@ -276,22 +273,21 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
-    """Computes the reference of an arm at rest, in the coordinates of its control law.
+    """Computes the reference of a resting arm, in the coordinates of its control law.
 
-    In joint space, the coordinates are the joint angles. The reference is the motion that
-    brings the joints to rest.
+    In joint space, this is the rest reference, which brings the joints to rest.
 
-    In task space, the coordinates describe the pose of the end effector. Their reference is the
-    present pose and its velocity, so that the law sees no error. `add_rest_torque` brings the
-    joints to rest instead, by a reference of their own.
+    In task space, the reference is the current pose of the end effector and its velocity, so
+    that the law sees no error. The joints are then brought to rest by `add_rest_torque`, with a
+    reference in joint coordinates.
 
-    The forces on other arms, which some laws reflect, are cleared, so that they do not move the
-    resting arm.
+    The forces of other arms, which some laws reflect, are reset to zero because they must not
+    move a resting arm.
 
     Args:
-        site: State of the site (the process that runs the arm). `task` is 1 in task space, and
-            0 in joint space. `felt`, the weighted forces on the other arms, is cleared.
-        q: Receives the reference, one number per coordinate, rad or m.
+        site: State of the site. `task` is 1 in task space, and 0 in joint space. `felt`, the
+            weighted sum of the forces on the other arms, is reset.
+        q: Receives the reference, one entry per coordinate, rad or m.
         qd: Receives the velocity of the reference, rad/s or m/s.
     """
     for i in range(q.shape[0]):
@@ -305,13 +301,12 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
 
 @leaf
 def _find_slip(site: SiteRow, i: int) -> float:
-    """Returns how far joint i deviates from its motion at rest, as a filtered error in rad/s.
+    """Returns the filtered deviation s of joint i from its rest reference, rad/s.
 
         s = qd - qd_ref + Lambda (q - q_ref)
 
-    The reference q_ref brings the joint to rest. The damping and the integral term of an arm at
-    rest act on s. Lambda is the rate of the adaptive law in joint space, and `REST_RATE_1_S`
-    with any other law, which has no such rate.
+    The damping and the integral term of a resting arm act on s. Lambda is the rate of the
+    adaptive law in joint space, or `REST_RATE_1_S` for other laws, which have no such rate.
 
     Returns:
         The deviation s, rad/s or m/s.
@@ -327,7 +322,7 @@ def _find_slip(site: SiteRow, i: int) -> float:
 
 @leaf
 def _shrink(torque: float, change: float) -> float:
-    """Returns a torque with a magnitude reduced by `change`, but at least zero.
+    """Returns a torque with its magnitude reduced by `change`, but not below zero.
 
     For example, 3 N m reduced by 2 gives 1 N m, and -1 N m reduced by 2 gives 0.
 
@@ -340,27 +335,27 @@ def _shrink(torque: float, change: float) -> float:
 
 @leaf
 def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
-    """Adds damping and an integral term to the torque of an arm at rest, and limits the sum.
+    """Adds damping and an integral term to the torque of a resting arm, and limits the sum.
 
-    The sum w - B s is added to the torque `tau`. B is the damping in N m s/rad, and s the
-    filtered deviation of a joint from its reference in rad/s. The torque before the limit is
+    w - B s is added to the torque `tau`, where B is the damping in N m s/rad, and s the
+    filtered deviation of a joint from its reference in rad/s. The torque before limiting is
     stored in `u`.
 
-    The integral term w, in N m, carries a constant load, for example unknown gravity:
+    The integral term w, in N m, supports a constant load, for example unknown gravity:
 
-    - At the start of the rest, it is the difference between the previous torque and the torque
-      that the law computes for the rest reference. The faster the arm moves, the more this
-      difference is reduced. It is zero in the first tick of a run, which has no previous
-      torque.
-    - While the arm brakes, w may act in the direction of motion and so delay the stop. Then its
-      magnitude is reduced by B |qd| in each tick, at most to zero. qd is the joint velocity.
-    - After this tick, `advance_rest` integrates it.
+    - The initial value is the difference between the previous torque and the law's torque for
+      the rest reference, scaled down the faster the arm moves. It is zero in the first tick of
+      a run, where there is no previous torque.
+    - While the arm brakes, w may act in the direction of motion and delay the stop. In that
+      case its magnitude is reduced by B |qd| per tick, but not below zero. qd is the joint
+      velocity.
+    - `advance_rest` integrates w after this tick.
 
     Args:
-        k: Number of the control period.
-        t_ns: Time of the period, ns since the start of the session.
-        site: State of the site (the process that runs the arm); changed. `tau_held` is w, and
-            `return_from_ns` the start of the rest.
+        k: Number of the tick.
+        t_ns: Time of the tick, ns since the start of the session.
+        site: State of the site; modified. `tau_held` is w, and `return_from_ns` the start of
+            the rest.
     """
     starts_to_rest = t_ns == site.return_from_ns
     brakes = _brakes(t_ns, site)
@@ -392,21 +387,21 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 def advance_rest(site: SiteRow) -> None:
     """Updates the integral term w of the torque that holds an arm at rest.
 
-    The term carries a constant load, such as unknown gravity. In each control period h, it
+    The term supports a constant load, such as unknown gravity. In each control period h, it
     changes by
 
         -h k B s,    s = qd - qd_ref + Lambda (q - q_ref)
 
-    where q and qd are the position and velocity of a joint, q_ref and qd_ref those of the
-    reference that brings it to rest, Lambda a rate in 1/s, and k B the integral gain.
+    where q and qd are the position and velocity of a joint, q_ref and qd_ref those of the rest
+    reference, Lambda a rate in 1/s, and k B the integral gain.
 
-    If a limit has cut off a part of the torque, w does not change in the direction of this
-    part. Otherwise it would grow without effect (windup).
+    If a torque limit is active, w does not change further in the direction of the limit,
+    because it would grow without effect (windup).
 
     Args:
-        site: State of the site (the process that runs the arm). For each joint, `tau_held` is w
-            in N m, which is changed, and `integral` is k B in N m/rad. `u` is the torque before
-            its limits and `tau` after them, N m.
+        site: State of the site. For each joint, `tau_held` is w in N m (modified) and
+            `integral` is k B in N m/rad. `u` is the torque before limiting and `tau` the torque
+            after it, N m.
     """
     for i in range(site.joints):
         slip = _find_slip(site, i)
@@ -419,14 +414,14 @@ def advance_rest(site: SiteRow) -> None:
 
 @leaf
 def limit_torque_rate(site: SiteRow) -> None:
-    """Limits the change of the torque from the previous to the present control period.
+    """Limits the change of the torque between the previous and the current control period.
 
-    Before the first period the torque is zero. While an arm comes to rest, the torque against
-    the motion of a joint may change by B |qd| more in a period. B is the damping of the arm at
-    rest in N m s/rad, and qd the velocity of the joint in rad/s.
+    The torque before the first period is taken as zero. While an arm comes to rest, a torque
+    that opposes the motion of a joint may change by an additional B |qd| per period. B is the
+    rest damping in N m s/rad, and qd the joint velocity in rad/s.
 
     Args:
-        site: State of the site (the process that runs the arm); its torque `tau` is limited.
+        site: State of the site, whose torque `tau` is limited.
     """
     braking = rests(site)
     for i in range(site.joints):

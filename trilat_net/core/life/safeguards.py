@@ -1,16 +1,15 @@
-"""Limits the speed of the position that an arm follows, and avoids a jump of the torque.
+"""Limits the speed of the reference, and prevents jumps of the torque.
 
 A network fault or a sudden motion of another arm must not make an arm jump.
 
-- `limit_reference` limits the speed of the reference, the position at which the control law
-  aims.
-- `return_to_law` is used when an arm begins to move after a rest. It changes the torque
-  gradually from the torque that held the arm to the torque of the control law.
+- `limit_reference` limits the speed of the reference that the control law follows.
+- `return_to_law` is used when a resting arm begins to move. It blends from the torque that held
+  the arm to the torque of the control law.
 
 Invariant:
 
-- The reference moves no faster than its speed limit, whatever the other arms do.
-- A reference without a speed limit is not changed.
+- The reference never moves faster than its speed limit, whatever the other arms do.
+- A reference without a speed limit is not modified.
 """
 
 from math import inf, isfinite
@@ -22,20 +21,20 @@ from ..step.jit import leaf
 from ..step.row_fields import SiteRow
 
 BLEND_S = 0.1
-"""Duration of the change from the torque at rest to that of the law, s."""
+"""Duration of the blend from the rest torque to the torque of the law, s."""
 
 
 @leaf
 def limit_reference(k: int, site: SiteRow) -> None:
     """Limits the speed of the reference, the position that the arm follows.
 
-    The reference moves from its value in the previous tick (period of the control loop) by at
-    most the permitted step. A reference that was held back catches up later. At the first tick
-    it starts from the pose of the arm.
+    Starting from its value in the previous tick, the reference moves by at most the permitted
+    step. If the limit has delayed it, it catches up later. In the first tick, it starts at the
+    pose of the arm.
 
     Args:
-        k: Number of the tick (control period).
-        site: State of the site (the process that runs the arm), whose reference is changed.
+        k: Number of the tick.
+        site: State of the site, whose reference is modified.
     """
     if k == site.first:
         for i in range(site.shared):
@@ -63,17 +62,15 @@ def limit_reference(k: int, site: SiteRow) -> None:
 def _limit_turn(site: SiteRow) -> None:
     """Limits how fast the orientation of the reference turns, about each axis of the base.
 
-    The reference is the pose that the arm follows. It may turn from its orientation in the
-    previous tick (period of the control loop) by at most the limit times the period, about each
-    axis. If it turns too far, the whole rotation vector of the turn is multiplied by the same
-    factor, so that the direction of its axis is kept. The reference then turns at the velocity
-    of the shortened turn.
+    In one tick, the reference may turn about each axis by at most the limit times the control
+    period. If the turn is too large, its rotation vector is scaled down, which preserves the
+    direction of the axis. The velocity of the reference is then that of the reduced turn.
 
     Args:
-        site: State of the site (the process that runs the arm). Its coordinates 0 to 2 are a
-            position, and 3 to 5 a rotation vector in rad. `q_followed` is the reference in the
-            previous tick. `q_des` and `qd_des`, the new reference and its velocity, are
-            limited. `qd_des_limit` contains the limits of the velocity, rad/s.
+        site: State of the site. Its coordinates 0 to 2 are a position, and 3 to 5 a rotation
+            vector in rad. `q_followed` is the reference in the previous tick. `q_des` and
+            `qd_des`, the new reference and its velocity, are limited. `qd_des_limit` contains
+            the limits of the velocity, rad/s.
     """
     vector_before = read_three(site.q_followed[3:])
     orientation_before = rotation_matrix(vector_before)
@@ -102,10 +99,10 @@ def _limit_turn(site: SiteRow) -> None:
 
 @leaf
 def is_torque_finite(site: SiteRow) -> bool:
-    """Returns True if the torque of each joint that the control law wrote is finite.
+    """Returns True if the control law wrote a finite torque for every joint.
 
-    The torque is NaN before the law is called. Therefore the function also notices a law that
-    wrote no torque at all.
+    The torque is set to NaN before the law is called, so a law that writes no torque is also
+    detected.
     """
     finite = True
     for i in range(site.joints):
@@ -117,12 +114,11 @@ def is_torque_finite(site: SiteRow) -> bool:
 def return_to_law(t_ns: int, site: SiteRow) -> None:
     """Blends from the torque that held an arm at rest to the torque of its control law.
 
-    The blend is linear and takes BLEND_S, because a sudden change of torque would make the arm
-    jerk.
+    The blend is linear and takes BLEND_S. A sudden change of torque would make the arm jerk.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm), whose torque `tau` is changed.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site, whose torque `tau` is modified.
     """
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9
     progress = min(elapsed_s / BLEND_S, 1.0)

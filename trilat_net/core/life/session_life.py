@@ -1,39 +1,38 @@
 """Decides when an arm waits, follows other arms, comes to rest, or stops after a fault.
 
-A site is a process that runs one arm, and its peers are the other sites, whose states it
-receives. A peer is heard while its states arrive, and silent otherwise. The rules of this
-module are called `glide`. They let an arm start and stop smoothly when its peers appear or fall
-silent. A site has one of these modes:
+A peer is heard while its samples arrive, and silent otherwise. The rules of this module, called
+`glide`, make an arm start and stop smoothly when its peers appear or fall silent. A site is
+always in one of these modes:
 
-- WAITING: The arm is at rest, until all peers that it follows are heard. Then the mode becomes
+- WAITING: The arm rests until all peers that it follows are heard. Then the mode becomes
   RETURN.
-- RETURN: The arm moves smoothly to the peers. After that, the mode becomes RUN.
-- RUN: The arm follows the peers. If a peer that it follows falls silent, the mode becomes
-  HOLD.
+- RETURN: The arm aligns smoothly with the peers. Then the mode becomes RUN.
+- RUN: The arm follows the peers. If a peer that it follows falls silent, the mode becomes HOLD.
 - HOLD: The arm comes to rest. If all peers are heard again, the mode becomes RETURN.
-- FAULT: A limit was exceeded, a number was not finite, or the arm was lost. The arm comes to
-  rest. Only the order RESET leads back to WAITING.
-- STOPPED: The arm was stopped by order, or its dead-man switch was released. The arm comes to
-  rest. The order ENABLE leads back to WAITING. If the switch was the only cause, holding the
-  switch again does so too.
+- FAULT: A limit was exceeded, a value was not finite, or the connection to the arm was lost.
+  The arm comes to rest. Only the RESET command leads back to WAITING.
+- STOPPED: The arm was stopped by a command, or its dead-man switch was released. The arm comes
+  to rest. The ENABLE command leads back to WAITING, and so does holding the switch again if its
+  release was the only cause.
 
-The reference of a site is the position that its arm follows. In RUN, it is the weighted mean of
-the positions of the peers. In RETURN, an offset is added, which falls from its start value D to
-zero within the time T:
+The reference of a site is the position that its arm follows. In RUN, the reference is the
+weighted mean of the peers' positions. In RETURN, an offset is added that decays from its
+initial value D to zero within the time T:
 
     offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2,    x = t / T from 0 to 1
     T = max(MIN_ALIGN_NS, 1.5 |D| / align_speed)
 
-Here t is the time since the start of RETURN, and D' the start value of the rate of the offset.
-The factor 1.5 is the largest slope of the polynomial. Therefore the offset is no faster than
-`align_speed`, apart from the effect of D'. For an orientation, the offset is a rotation vector.
+Here t is the time since the start of RETURN, and D' the initial rate of the offset. The factor
+1.5 is the maximum slope of the polynomial, so the offset changes no faster than `align_speed`,
+apart from the effect of D'. For an orientation, the offset is a rotation vector.
 
 Invariant:
-    - In WAITING, HOLD, STOPPED and FAULT, the arm comes to rest in the same way, see `resting`.
-    - In RETURN and RUN neither the reference nor its velocity jumps, and the velocity is always
-      the derivative of the reference.
-    - A peer that is at rest is followed like any other peer.
-    - Messages of peers neither cause nor end FAULT and STOPPED.
+    - In WAITING, HOLD, STOPPED and FAULT, the arm comes to rest in the same way (see
+      `resting`).
+    - In RETURN and RUN, neither the reference nor its velocity jumps, and the velocity is
+      always the derivative of the reference.
+    - A resting peer is followed like any other peer.
+    - Messages from peers neither cause nor end FAULT and STOPPED.
 """
 
 from math import isfinite
@@ -58,11 +57,11 @@ from .resting import advance_rest_reference, enter_rest, put_rest_reference, res
 MIN_ALIGN_NS = 250_000_000
 """Shortest duration of an alignment, ns."""
 RETURN_NS = 100_000_000
-"""Duration of the change from the torque at rest to that of the law, ns."""
+"""Duration of the blend from the rest torque to the torque of the law, ns."""
 HELD_OVERRUN_TICKS = 20
-"""Largest number of ticks that a site with an external arm may miss without entering HOLD."""
+"""Largest number of missed ticks for which a site with an external arm does not enter HOLD."""
 FAULT_OVERRUN_TICKS = 200
-"""Largest number of ticks that a site may miss without entering FAULT."""
+"""Largest number of missed ticks for which a site does not enter FAULT."""
 
 _RUN = int(Mode.RUN)
 _DIVERGED = int(Mode.DIVERGED)
@@ -103,14 +102,13 @@ _ORDER_HELD = int(LifeOrder.HELD)
 
 @leaf
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
-    """Returns True if this arm has recently received the state of every arm that it follows.
+    """Returns True if no peer that this arm follows is silent.
 
-    The states are called samples, and the followed arms peers. A peer counts as silent if none
-    of its samples came into use within the last `silence_ns`. Peers with a weight (dominance
-    factor) of zero are not followed, and so may be silent.
+    A peer is silent if none of its samples came into use within the last `silence_ns`. Peers
+    with a dominance factor of zero are not followed, and may be silent.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
+        t_ns: Time, ns since the start of the session.
         silence_ns: Longest time without a sample, ns.
         links: State of each link from another site, one row per link.
     """
@@ -126,20 +124,18 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
 def _alignment_s(site: SiteRow) -> float:
     """Returns the duration T of an alignment, s.
 
-    An alignment is the smooth return of an arm to the arms that it follows, its peers, in the
-    mode RETURN. An offset is added to the reference, the position computed from the peers, and
-    falls from its start value to zero within the time T. The largest slope of its polynomial is
-    1.5 times its mean slope, so with
+    An alignment is the smooth return of an arm to its peers in the mode RETURN. An offset is
+    added to the reference and decays from its initial value to zero within the time T. The
+    maximum slope of its polynomial is 1.5 times its mean slope, so with
 
         T = 1.5 distance / align_speed
 
-    the offset is no faster than the limit `align_speed`. T is at least MIN_ALIGN_NS.
+    the offset changes no faster than the limit `align_speed`. T is at least MIN_ALIGN_NS.
 
     Args:
-        site: State of the site (the process that runs the arm). `q_held` is the start value of
-            the offset, rad or m. For a pose, its last three coordinates are a rotation vector,
-            rad. `align_speed` applies to each linear coordinate, rad/s or m/s, and to the angle
-            of the rotation, rad/s.
+        site: State of the site. `q_held` is the initial value of the offset, rad or m. For a
+            pose, its last three coordinates are a rotation vector, rad. `align_speed` applies
+            to each linear coordinate, rad/s or m/s, and to the angle of the rotation, rad/s.
     """
     longest_distance = 0.0
     for i in range(count_linear_coordinates(site)):
@@ -154,28 +150,27 @@ def _alignment_s(site: SiteRow) -> float:
 
 @leaf
 def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array) -> None:
-    """Starts an alignment, by which the reference of an arm returns smoothly to its peers.
+    """Starts an alignment, in which the reference of an arm returns smoothly to its peers.
 
-    The reference is the position that the arm follows, and the peers are the other arms. During
-    the alignment, in the mode RETURN, the reference is that of the peers plus an offset. The
-    offset starts as the difference between a given reference and that of the peers, and falls
-    to zero, see `_find_offset`. Therefore the reference does not jump.
+    During the alignment, in the mode RETURN, the reference is that of the peers plus an offset.
+    The initial offset is the difference between a given reference and that of the peers, so the
+    reference does not jump. The offset decays to zero (see `_find_offset`).
 
-    If a coordinate of the offset, or its angle, is above the limit, the mode does not change,
+    If a coordinate of the offset, or its angle, exceeds the limit, the mode does not change,
     and only the reason `ALIGN_LIMIT` is stored.
 
-    An orientation is a rotation vector in the coordinates 3 to 5. With the rotation matrices
-    R_q of the given reference and R_p of that of the peers, its offset is the turn R_q R_p',
-    which leads from the peers to the given reference. The angular velocity of the turn is the
-    given angular velocity minus that of the peers, rotated by the turn.
+    An orientation is a rotation vector in the coordinates 3 to 5. If R_q and R_p are the
+    rotation matrices of the given reference and of the peers' reference, the offset is the
+    rotation R_q R_p' from the latter to the former. Its angular velocity is the given angular
+    velocity minus that of the peers, rotated by the offset.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site, the process that runs the arm; changed. `q_des` and `qd_des`
-            are the reference of the peers and its velocity. If the alignment starts, `q_held`
-            receives the offset, `qd_held` its rate, `return_from_ns` its start, and `tau_held`
-            the last torque, from which the torque blends to that of the law (`return_to_law`).
-        reason: Reason of the change of mode, a `LifeReason`.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site; modified. `q_des` and `qd_des` are the reference of the peers
+            and its velocity. If the alignment starts, `q_held` receives the offset, `qd_held`
+            its rate, `return_from_ns` its start, and `tau_held` the last torque, from which the
+            torque blends to that of the law (`return_to_law`).
+        reason: Reason for the change of mode, a `LifeReason`.
         q: Reference from which the alignment starts, rad or m.
         qd: Velocity of this reference, rad/s or m/s.
     """
@@ -211,15 +206,15 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
 
 @leaf
 def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
-    """Starts the smooth return of an arm at rest to the arms that it follows (an alignment).
+    """Starts the smooth return of a resting arm to its peers (an alignment).
 
-    The alignment starts from the reference at rest, the motion that the law of the resting arm
-    follows. This reference is first written into `q_followed` and `qd_followed`.
+    The alignment starts from the rest reference, which is first written into `q_followed` and
+    `qd_followed`.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site, the process that runs the arm; changed.
-        reason: Reason of the change of mode, a `LifeReason`.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site; modified.
+        reason: Reason for the change of mode, a `LifeReason`.
     """
     put_rest_reference(site, site.q_followed, site.qd_followed)
     _start_alignment(
@@ -229,19 +224,19 @@ def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
 
 @leaf
 def _extrapolate_reference(site: SiteRow) -> None:
-    """Estimates where the reference of a moving arm would be now, if nothing had changed.
+    """Extrapolates the previous reference of a moving arm to the current tick.
 
-    The reference is the position that the arm follows, computed from the positions of its
-    peers, the other arms. It jumps if a peer is dropped because it is lost, or restored when it
+    The reference computed from the peers jumps if a lost peer is dropped, or restored when it
     comes back. An alignment then leads smoothly to the new reference. It starts from the
-    reference of the previous tick (period of the control loop), advanced by one period at its
-    velocity. An arm at rest needs no such estimate, because it has a reference of its own.
+    reference of the previous tick, advanced by one control period at its velocity. A resting
+    arm needs no extrapolation, because it has a reference of its own.
 
-    An orientation, a rotation vector in the coordinates 3 to 5, turns at its angular velocity.
+    An orientation (a rotation vector in the coordinates 3 to 5) is advanced at its angular
+    velocity.
 
     Args:
-        site: State of the site, the process that runs the arm. `q_followed` and `qd_followed`
-            are the reference of the previous tick and its velocity; `q_followed` is advanced.
+        site: State of the site. `q_followed` and `qd_followed` are the reference of the
+            previous tick and its velocity; `q_followed` is advanced.
     """
     period_s = 1.0 / site.rate_hz
     for i in range(count_linear_coordinates(site)):
@@ -254,15 +249,15 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the torque blends from the torque at rest to the torque of the law.
+    """Returns True while the torque blends from the rest torque to the torque of the law.
 
-    The blend starts when the arm begins to move from rest towards the other arms, and takes
-    `RETURN_NS`. An arm that aligns with the others because one of them was lost or came back
+    The blend starts when a resting arm begins to move towards the other arms, and takes
+    `RETURN_NS`. An arm that realigns with the others because one of them was lost or came back
     was not at rest, and needs no blend.
 
     Args:
         t_ns: Time, ns since the start of the session.
-        site: State of the site, the process that runs the arm.
+        site: State of the site.
     """
     # A site that drops or restores a peer aligns without a rest before.
     rested = site.reason != _DROPPED and site.reason != _RESTORED
@@ -273,16 +268,17 @@ def is_law_returning(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
-    """Stops an arm for good: enters the mode FAULT or STOPPED, which only an order can end.
+    """Enters FAULT or STOPPED, which only a command can end.
 
-    The arm comes to rest and is then held against gravity. Estimates of its parameters that are
-    not finite become zero, because the gravity torque is computed from them and must be finite.
+    The arm comes to rest and is then held against gravity. Parameter estimates that are not
+    finite are reset to zero, because the gravity torque is computed from them and must be
+    finite.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm); changed.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site; modified.
         mode: The mode to enter.
-        reason: Reason of the change of mode, a `LifeReason`.
+        reason: Reason for the change of mode, a `LifeReason`.
     """
     for p in range(site.theta_hat.shape[0]):
         if not isfinite(site.theta_hat[p]):
@@ -292,9 +288,9 @@ def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
 
 @leaf
 def _find_fault(site: SiteRow) -> int:
-    """Returns why the motion of the arm is a fault, as a `LifeReason`, or -1 if it is not.
+    """Returns the `LifeReason` of a fault in the motion of the arm, or -1 if there is none.
 
-    A fault is a number that is not finite, an angle beyond its limits, or a speed above its
+    A fault is a value that is not finite, an angle beyond its limits, or a speed above its
     limit.
     """
     for i in range(site.joints):
@@ -311,17 +307,16 @@ def _find_fault(site: SiteRow) -> int:
 
 @leaf
 def _apply_order(t_ns: int, site: SiteRow) -> None:
-    """Changes the mode of an arm after an order, or because its control loop missed ticks.
+    """Changes the mode of an arm after a command, or because its control loop missed ticks.
 
-    An order comes from a person, such as stop, or from the site itself, such as the loss of a
-    real arm. Missed ticks (control periods) stop an arm that moves. At most one branch applies.
-    Orders that leave FAULT or STOPPED come first; in these modes all other orders have no
-    effect.
+    Commands are issued by a person (for example, stop) or by the site itself (for example, when
+    a real arm is lost). Missed ticks stop a moving arm. At most one branch applies. Commands
+    that leave FAULT or STOPPED are checked first; all other commands have no effect in these
+    modes.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm), with the order and the number
-            of missed ticks.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site, with the command and the number of missed ticks.
     """
     order = site.order
     skipped = site.skipped
@@ -366,8 +361,7 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
 def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Changes the mode of an arm after a fault, or because peers fall silent or return.
 
-    A peer is another arm that this arm follows. The first change in this list that applies
-    takes place (the code calls the mode RETURN `_ALIGN`):
+    The first applicable change in this list is made (the code calls the mode RETURN `_ALIGN`):
 
         any mode        a fault of the motion                       -> FAULT
         WAITING         all peers are heard                         -> RETURN
@@ -378,10 +372,10 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
         RETURN          the time of the alignment has passed        -> RUN
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site, the process that runs the arm. `return_from_ns` is the time of
-            the last change to rest, to an alignment or to RUN. `regrouped` is the reason if a
-            peer was dropped or restored in this tick, otherwise 0.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site. `return_from_ns` is the time of the last change to rest, to an
+            alignment or to RUN. `regrouped` is the reason if a peer was dropped or restored in
+            this tick, otherwise 0.
         links: State of each link, one row per peer.
     """
     fault = _find_fault(site)
@@ -414,21 +408,19 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Decides whether an arm waits, follows, comes to rest or stops, and computes its goal.
+    """Updates the mode of an arm (such as waiting, following or resting) and its reference.
 
-    What the arm does is called its mode, for example RUN while it follows the other arms, its
-    peers. The mode changes by an order of a person or of the arm's own control process (site),
-    by a fault of the arm, or because peers fall silent or are heard again. The goal is called
-    the reference, the position that the arm follows.
+    The mode changes on a command of a person or of the site itself, on a fault of the arm, or
+    when peers fall silent or are heard again.
 
     Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms' positions
-    and its derivative. After the call, they contain the reference: this mean in the mode RUN,
-    the mean plus an offset in RETURN, and the reference that brings the arm to rest otherwise.
-    The reference of the previous control period is in `q_followed` and `qd_followed`.
+    and its derivative. After the call, they contain the reference: this mean in RUN, the mean
+    plus an offset in RETURN, and the rest reference in all other modes. The reference of the
+    previous tick is in `q_followed` and `qd_followed`.
 
     Args:
         t_ns: Time, ns since the start of the session.
-        site: State of the site; changed.
+        site: State of the site; modified.
         links: States of the links from the other sites, one row per link.
     """
     if site.mode == _DIVERGED:
@@ -453,21 +445,20 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns the remaining offset of an arm that returns to its peers, and the offset's rate.
+    """Returns the current alignment offset of one coordinate, and its rate.
 
-    The peers are the arms that it follows. During the smooth return (an alignment), an offset
-    is added to the position computed from the peers. It falls to zero within the time T, and is
-    the cubic Hermite polynomial with the start value D, the start rate D' and zero value and
-    rate at the end:
+    During an alignment, an offset is added to the position computed from the peers. It decays
+    to zero within the time T, following the cubic Hermite polynomial with initial value D,
+    initial rate D', and zero final value and rate:
 
         offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2
         d offset / dx = T D' (1 - x) (1 - 3 x) - 6 D x (1 - x)
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
+        t_ns: Time, ns since the start of the session.
         duration_s: Duration T of the alignment, s.
-        site: State of the site (the process that runs the arm). The alignment started at
-            `return_from_ns`, with D in `q_held` and D' in `qd_held`.
+        site: State of the site. The alignment started at `return_from_ns`, with D in `q_held`
+            and D' in `qd_held`.
         i: Index of the coordinate.
 
     Returns:
@@ -488,22 +479,20 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
 
 @leaf
 def _add_offset(t_ns: int, site: SiteRow) -> None:
-    """Computes the reference of an arm that returns smoothly to its peers, the other arms.
+    """Adds the alignment offset to the reference of an arm that returns to its peers.
 
-    This return is called alignment. The reference, which the arm follows, is the reference of
-    the peers plus an offset, which falls to zero. The offset and its rate are added to position
-    and velocity. `_start_alignment` has stored their start values.
+    The offset is added to the position, and its rate to the velocity. Their initial values were
+    stored by `_start_alignment`.
 
-    For an orientation, the offset is a turn, which follows the rotation of the peers: the
-    rotation matrix of the reference is T R, with T of the turn and R of the peers. The angular
-    velocity is the sum of two terms: the angular velocity of the turn, and that of the peers,
-    rotated by the turn.
+    For an orientation, the offset is a rotation T applied after the rotation R of the peers, so
+    the rotation matrix of the reference is T R. Its angular velocity is the angular velocity of
+    the offset plus that of the peers, rotated by the offset.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site, the process that runs the arm. In a pose, the coordinates 0 to
-            2 are a position, and 3 to 5 a rotation vector in rad. `q_des` and `qd_des` are the
-            reference of the peers and its velocity, and receive the sums.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site. In a pose, the coordinates 0 to 2 are a position, and 3 to 5 a
+            rotation vector in rad. `q_des` and `qd_des` are the reference of the peers and its
+            velocity, and receive the sums.
     """
     duration_s = _alignment_s(site)
     for i in range(count_linear_coordinates(site)):

@@ -1,13 +1,13 @@
 """Computes how programs move the planar arms of several simulated runs at once.
 
-A program may act as the operator of an arm, for example a policy in training. It decides at a
-fixed rate where it pulls the arm. `OwnHand` computes the motion for one run. This module
-computes it for all runs of a training environment in one call, with the decisions of all
-programs as one array, so that no Python code runs for a single run.
+A program, for example a policy in training, can act as the operator of an arm. It decides at a
+fixed rate where to pull the arm. `OwnHand` computes the resulting motion for one run. This
+module computes it for all runs of a training environment in one call, with the decisions of all
+programs in one array. No Python code runs per simulation.
 
 Invariant:
-    - The results are those of `OwnHand.advance_span`, bit for bit, if each program decides in
-      time. `SeveralHands.explain` names the programs that this module cannot compute.
+    - The results are bit-identical to those of `OwnHand.advance_span`, provided that each
+      program decides in time. `SeveralHands.explain` states why a program is not supported.
 """
 
 import math
@@ -23,29 +23,31 @@ from .live_hand import GLIDE_NS, GRIP_NS, SILENCE_NS, HandRules, find_glide_ns, 
 AXES = 2
 """Number of coordinates of an action."""
 ACTION_NUMBERS = 1 + 2 * AXES
-"""Values of an action in a tick: the grip, the target, and the target one second later.
+"""Number of values of an action in one tick: the grip, the target, and the target one second
+later.
 """
 
 
 class _HandArrays(NamedTuple):
-    """State and limits of the programs that pull the arms, in L simulations side by side.
+    """State and limits of the programs that pull the arms, for L simulations in parallel.
 
-    Each row belongs to one simulation. `HandMemory` and `HandRules` explain the same quantities
-    for a single simulation.
+    Each row belongs to one simulation. The quantities are described in `HandMemory` and
+    `HandRules`.
 
     Attributes:
         holds: 1 if the program holds the arm, shape (L,).
         grip: Firmness of the grip, 0 to 1, shape (L,).
         target: Position of the target, m or rad, or the force, N, shape (L, 2).
         rate: Velocity of the target, shape (L, 2).
-        goal: Position to which the target moves, or the force, shape (L, 2).
-        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+        goal: Position towards which the target moves, or the force, shape (L, 2).
+        arrives_ns: Time at which the target reaches the goal, ns since the start of the
+            session.
         starts_at_arm: 1 if the target starts at the pose of the arm, 0 if it starts at zero.
         speed_limit: Largest speed of the target, m/s or rad/s.
         acceleration: Largest acceleration of the target, m/s^2 or rad/s^2.
         centre: Centre of the reachable shell, m, shape (L, 2).
-        radii_m: Inner and outer radius of the shell, shape (L, 2). If there is no shell, the
-            inner radius is 0 and the outer radius is infinite.
+        radii_m: Inner and outer radius of the shell, shape (L, 2); 0 and inf if there is no
+            shell.
         low: Smallest coordinates of a goal, rad or m, shape (L, 2).
         high: Largest coordinates of a goal, rad or m, shape (L, 2).
     """
@@ -67,15 +69,15 @@ class _HandArrays(NamedTuple):
 
 @leaf
 def _put_nearest_goal(lane: int, goal: Array, hands: _HandArrays) -> None:
-    """Stores the goal to which a program pulls its arm, moved to the nearest point in reach.
+    """Stores the goal of a program, projected onto the reachable region.
 
-    The point is first moved into a box, and then into a spherical shell, exactly as
+    The goal is projected first onto a box and then onto a spherical shell, exactly as
     `HandReach.find_nearest` does for a single simulation.
 
     Args:
-        lane: Index of the run among the runs that are computed side by side.
+        lane: Index of the run among the runs that are computed in parallel.
         goal: The goal, shape (2,), m or rad.
-        hands: State of the programs' pulls in all runs; the goal is written into it.
+        hands: State of the hands in all runs; the goal is written into it.
     """
     for i in range(AXES):
         hands.goal[lane, i] = min(max(goal[i], hands.low[lane, i]), hands.high[lane, i])
@@ -118,24 +120,24 @@ def _advance_hands(
 ) -> None:
     """Computes how programs pull the arms in the next ticks, for several simulations at once.
 
-    A tick is a period of the control loop. Each simulation has one program. It decides at the
-    start, and the decision acts for all these ticks.
+    Each simulation has one program. Its decision at the first tick remains in effect for all
+    these ticks.
 
     Args:
         runs: Number of runs.
         first: First tick of each run, shape (L,).
         count: Number of ticks.
         rate_hz: Tick rate of the sites, Hz.
-        period_ticks: Time from one decision to the next, ticks.
+        period_ticks: Time between decisions, ticks.
         is_idle: 1 for runs that are not advanced, shape (L,).
-        acts: 1 for runs in which a decision begins to act at the first tick, shape (L,).
-        goals: The decisions that begin to act: the position to which the arm is pulled, m or
-            rad, or the force, N, shape (L, 2).
+        acts: 1 for runs in which a decision takes effect at the first tick, shape (L,).
+        goals: The decisions that take effect: the position towards which the arm is pulled, m
+            or rad, or the force, N, shape (L, 2).
         poses: Pose of the arm at the first tick, m or rad, shape (L, 2).
-        hands: State of the programs' pulls in all runs; changed.
+        hands: State of the hands in all runs; modified.
         rows: Buffer for the actions of one run, shape (ticks, 3 + 2 * 2).
-        actions: Receives for each tick and lane the grip, the target, and the target one second
-            later, shape (ticks, 5, L).
+        actions: Receives the grip, the target, and the target one second later for each tick
+            and lane, shape (ticks, 5, L).
     """
     grip_step = 1e9 / (GRIP_NS * rate_hz)
     for lane in range(runs):
@@ -186,19 +188,19 @@ def _advance_hands(
 class SeveralHands:
     """Computes how programs pull the arms in several simulations at once.
 
-    A training environment, for example, simulates many runs side by side, and in each run one
-    program moves an arm. One compiled call then replaces a call per run.
+    A training environment, for example, simulates many runs in parallel, with one program
+    moving one arm in each run. One compiled call then replaces one call per run.
 
     Args:
         count: Number L of runs.
         most_ticks: Largest number of ticks of a span.
         rate_hz: Tick rate of the sites, Hz.
-        period_ticks: Time from one decision to the next, ticks.
+        period_ticks: Time between decisions, ticks.
 
     Attributes:
         arrays: State and limits of the hands.
-        actions: For each tick of the latest span and each run the grip, the target, and the
-            target one second later, shape (ticks, 5, L).
+        actions: Grip, target, and target one second later, for each tick of the latest span and
+            each run, shape (ticks, 5, L).
     """
 
     axes = AXES
@@ -236,18 +238,15 @@ class SeveralHands:
 
     @staticmethod
     def explain(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Returns why a program's pulls cannot be computed for several simulations at once.
+        """Returns why a program is not supported by `SeveralHands`, or "" if it is supported.
 
-        The result is empty if they can. Otherwise the caller computes each simulation alone, by
+        For a program that is not supported, the caller computes each simulation separately with
         `OwnHand`.
 
         Args:
-            rules: Limits of the program's actions.
-            period_ticks: Time from one decision to the next, ticks.
-            largest_action: Largest absolute value of a number of an action.
-
-        Returns:
-            The reason. Empty if the pulls can be computed together.
+            rules: Limits on the program's actions.
+            period_ticks: Time between decisions, ticks.
+            largest_action: Largest absolute value of any component of an action.
         """
         if rules.size != AXES:
             return "actions that do not have two numbers"
@@ -258,14 +257,13 @@ class SeveralHands:
         return ""
 
     def begin(self, run: int, rules: HandRules) -> None:
-        """Resets the state of one simulation, whose program does not hold its arm yet.
+        """Resets the state of one simulation, in which the program does not yet hold its arm.
 
-        The method is called for each simulation before its first tick (period of the control
-        loop).
+        Must be called for each simulation before its first tick.
 
         Args:
             run: Index of the run.
-            rules: Limits of the program's actions.
+            rules: Limits on the program's actions.
         """
         hands = self.arrays
         reach = rules.reach
@@ -293,17 +291,17 @@ class SeveralHands:
         goals: Array,
         poses: Array,
     ) -> None:
-        """Computes how each program pulls its arm during the next control periods (ticks).
+        """Computes how each program pulls its arm during the next ticks, for all simulations.
 
-        Each simulation has one program and one arm, and one call advances all simulations.
+        Each simulation has one program and one arm.
 
         Args:
-            runs: Number of runs that are advanced. They are the first rows of the arrays.
+            runs: Number of runs to advance, which are the first rows of the arrays.
             first: First tick of each run, shape (L,).
             count: Number of ticks.
             is_idle: 1 for runs that are not advanced, shape (L,).
-            acts: 1 for runs in which a decision begins to act at the first tick, shape (L,).
-            goals: The decisions that begin to act, shape (L, 2).
+            acts: 1 for runs in which a decision takes effect at the first tick, shape (L,).
+            goals: The decisions that take effect, shape (L, 2).
             poses: Pose of the arm at the first tick, m or rad, shape (L, 2).
         """
         _advance_hands(

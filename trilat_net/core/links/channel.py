@@ -1,16 +1,15 @@
-"""Computes when a simulated network delivers each message, or whether it loses the message.
+"""Computes when a simulated network delivers each message, or whether the message is lost.
 
-In each control period, an arm sends its state, a sample, over a link to each other arm. The
-number of the period is called the stamp of the sample. The model of a link may delay, lose or
-duplicate samples, for example with losses in bursts. `schedule_deliveries` computes the
-deliveries of all samples up to a given sample.
+In each control period, an arm sends a sample over a link to each other arm. The model of a link
+may delay, lose or duplicate samples, for example with losses in bursts. `schedule_deliveries`
+computes the deliveries of all samples up to a given one.
 
 Invariant (law L4 of docs/develop/design.md):
 
 - What happens to sample m depends only on the key of the link (the seed of its random numbers),
-  on m, and on the network model in force at the stamp of m.
-- Models with a memory (bursts of loss, correlated delays, order of samples) advance from sample
-  to sample by index, regardless of the order in which samples arrive.
+  on m, and on the network model in force when m was sent.
+- Models with memory (loss bursts, correlated delays, sample ordering) advance from sample to
+  sample by index, regardless of the order in which samples arrive.
 """
 
 from ..step.jit import leaf
@@ -29,7 +28,7 @@ from .delay import (
 from .philox import uniforms
 
 LOST = -1
-"""Used in place of a due time for a sample that the network loses."""
+"""Used as the due time of a sample that the network loses."""
 
 _AR1 = int(DelayKind.AR1)
 
@@ -38,11 +37,13 @@ _AR1 = int(DelayKind.AR1)
 def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
     """Returns True if a message was sent during an outage, in which the link delivers nothing.
 
-    Outages are intervals that the scenario lists. Each includes its start and excludes its end.
+    Outages are time intervals listed in the scenario. Each includes its start and excludes its
+    end.
 
     Args:
-        stamp_ns: Stamp of the sample, ns since the epoch, the common start of the session.
-        link: State of the link, which gives the rows of its outages in `points`.
+        stamp_ns: Time at which the sample was sent, ns since the epoch (the common start of the
+            session).
+        link: State of the link, including which rows of `points` hold its outages.
         points: Table of points. The row of an outage contains its start and its end, ns.
     """
     for n in range(link.outage_first, link.outage_first + link.outage_count):
@@ -55,27 +56,26 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 def loses_samples(model: Row) -> bool:
     """Returns True if the model of a network link drops messages at random.
 
-    Otherwise, no random number needs to be drawn for the losses.
+    Otherwise, no random number needs to be drawn for losses.
     """
     return bool(model.loss_good != 0.0 or model.enter != 0.0)
 
 
 @leaf
 def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -> bool:
-    """Decides at random whether the next sample is lost, on a link whose losses come in bursts.
+    """Decides at random whether the next sample is lost, on a link with bursty losses.
 
-    The link is in a good or a bad state, each with its own probability of loss (model of
-    Gilbert and Elliott). From sample to sample, the link enters the bad state with the
-    probability `enter`, and leaves the bad state with the probability `leave`. A fresh chain
-    starts in its stationary distribution, where the bad state has the probability enter /
-    (enter + leave).
+    The link is in a good or a bad state, each with its own loss probability (Gilbert-Elliott
+    model). From one sample to the next, it enters the bad state with probability `enter`, and
+    leaves it with probability `leave`. A new chain starts in its stationary distribution, in
+    which the bad state has probability enter / (enter + leave).
 
     Args:
-        u: Uniform random number, which decides on the state of the chain.
-        v: Uniform random number, which decides on the loss.
+        u: Uniform random number that determines the state of the chain.
+        v: Uniform random number that determines the loss.
         fresh: True for the first sample of the model.
-        link: State of the link; changed.
-        model: Model in force, which loses samples.
+        link: State of the link; updated in place.
+        model: Model in force, which must be one that loses samples.
     """
     if fresh:
         # The test is a product, not a quotient, because enter + leave may be zero.
@@ -92,13 +92,13 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
     """Decides at random whether the simulated network loses a message.
 
-    Losses are independent or come in bursts, as the model says. The same seed, link and message
-    number always give the same decision, so that a run can be repeated.
+    Depending on the model, losses are independent or come in bursts. The same seed, link and
+    message number always lead to the same decision, so a run can be repeated.
 
     Args:
         sample: Index of the sample.
         fresh: True for the first sample of the model.
-        link: State of the link; changed.
+        link: State of the link; updated in place.
         model: Model in force.
     """
     if not loses_samples(model):
@@ -111,17 +111,17 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
 def delay_sample(stamp_ns: int, delay_us: int, link: LinkRow, model: Row) -> int:
     """Returns when a message that is not lost is delivered, ns since the start of the session.
 
-    This is the time of sending plus the delay. A minimum delay (play-out buffer) may postpone
-    it. A message is a sample: the state that another arm sends in a period of its control loop.
+    The delivery time is the sending time plus the delay. It may be postponed by a minimum delay
+    (play-out buffer).
 
     Args:
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        delay_us: Delay of the sample, us. If the sample has a copy, the smaller of the two
+        delay_us: Delay of the sample, us. If the sample was duplicated, the smaller of the two
             delays.
         link: State of the link. `due_before`, the latest delivery so far, is updated.
-        model: Model of delay and loss in force.
+        model: Delay and loss model in force.
     """
-    # The play-out buffer of the receiver keeps each sample for at least `playout_us`.
+    # The receiver's play-out buffer holds each sample for at least `playout_us`.
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
         # A sample waits for all older samples.
@@ -142,17 +142,18 @@ def find_due_ns(
 ) -> int:
     """Computes when a network link delivers a message, after its loss and delay were drawn.
 
-    Outages, duplicates and the order of messages matter too. The function must be called once
-    for each message (sample), in the order of the indices.
+    Outages, duplicates and message ordering are taken into account here. Must be called exactly
+    once per sample, in the order of the indices.
 
     Args:
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        lost: True if the model of random losses drops the sample.
-        delay_us: Delay of the sample, us, or LOST if a trace says that the sample is lost.
-        link: State of the link, with the seed `key` of its random numbers; changed. `copies`
-            counts the duplicated samples, and `due_before` is the latest due time so far, ns.
-        model: Model of delay and loss in force, a row of LINK_MODEL_DTYPE.
+        lost: True if the random loss model drops the sample.
+        delay_us: Delay of the sample, us, or LOST if a trace marks the sample as lost.
+        link: State of the link, including the seed `key` of its random numbers; updated in
+            place. `copies` counts the duplicated samples, and `due_before` is the latest due
+            time so far, ns.
+        model: Delay and loss model in force, a row of LINK_MODEL_DTYPE.
         points: Delay traces and outages of all links of the receiver.
 
     Returns:
@@ -168,9 +169,9 @@ def find_due_ns(
         is_duplicated = u < model.duplicate
         if is_duplicated:
             link.copies += 1
-            # The receiver uses whichever of the two arrives first. The kinds before AR1 are
-            # distributions, from which the copy gets a delay of its own. With all other kinds,
-            # the copy has the delay of the sample and changes nothing.
+            # The receiver uses whichever of the two arrives first. The types before AR1 are
+            # distributions, from which the copy draws its own delay. With all other types, the
+            # copy has the same delay as the sample and makes no difference.
             draws_delay_of_copy = model.kind < _AR1
             if draws_delay_of_copy:
                 copy_us = clamp_delay_us(draw_delay_us(link.key, sample, COPY, model))
@@ -183,20 +184,19 @@ def find_due_ns(
 def _due_ns(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Computes when a network link delivers a message, or whether it loses the message.
+    """Computes when a network link delivers a message, or whether the message is lost.
 
-    The function must be called once for each message (sample), in order, because bursts of loss
-    and correlated delays depend on the previous message. For the same reason, loss and delay
-    are drawn even for a message that is lost for another reason.
+    Must be called exactly once per sample, in order, because loss bursts and correlated delays
+    depend on the previous message. For the same reason, loss and delay are drawn even for a
+    message that is lost for another reason.
 
     Args:
-        sample: Index of the sample, the state that the sender sent in the tick (period of its
-            control loop) of this number.
-        stamp_ns: Time at which the sample was sent, ns since the epoch, the common start of the
-            session.
-        fresh: True for the first sample of the model, with which the model's state starts.
-        link: State of the link; changed, see `find_due_ns`.
-        model: Model of delay and loss in force, a row of LINK_MODEL_DTYPE.
+        sample: Index of the sample, which is the tick in which it was sent.
+        stamp_ns: Time at which the sample was sent, ns since the epoch (the common start of the
+            session).
+        fresh: True for the first sample of the model, which initialises the model's state.
+        link: State of the link; updated in place, see `find_due_ns`.
+        model: Delay and loss model in force, a row of LINK_MODEL_DTYPE.
         points: Delay traces and outages of all links of the receiver.
 
     Returns:
@@ -219,22 +219,22 @@ def _due_ns(
 
 @leaf
 def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) -> bool:
-    """Selects the model of delay and loss that applies to a message, by the time of sending.
+    """Selects the delay and loss model for a message according to when it was sent.
 
     A scenario may change the model at planned times, for example to a slower network after 5 s.
-    Messages that were sent before keep the earlier model.
+    Messages sent before then keep the earlier model.
 
     Args:
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        link: State of the link; its field `model`, the index of the model, is changed.
-        models: Models of the link, in the order in which they come into force.
+        link: State of the link. Its field `model`, the index of the model, is updated.
+        models: Models of the link, in the order in which they take effect.
 
     Returns:
-        True if the sample is the first sample of the model.
+        True if the sample is the first one of the model.
     """
     fresh = sample == 0
-    # Move on while a later model has come into force before the sample was sent.
+    # Advance while a later model took effect before the sample was sent.
     while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
         link.model += 1
         fresh = True
@@ -247,16 +247,15 @@ def schedule_deliveries(
 ) -> None:
     """Computes when a simulated network link delivers its messages, up to a given message.
 
-    Every arm's process sends its state once per control period; such a message is called a
-    sample. The model of the link's delay and loss may change at planned times. Each message
-    follows the model in force when it was sent.
+    The delay and loss model may change at planned times. Each message follows the model that
+    was in force when it was sent.
 
     Args:
-        sample: Index of the last sample to compute. Earlier samples are not computed twice.
-        link: State of the link; changed.
-        models: Models of the link's delay and loss, in the order in which they come into force.
-        dues: Receives the delivery times in ns since the start of the session, or LOST. It is a
-            ring: sample m is stored at m modulo its length.
+        sample: Index of the last sample to compute. Samples already computed are skipped.
+        link: State of the link; updated in place.
+        models: Delay and loss models of the link, in the order in which they take effect.
+        dues: Output ring buffer for the delivery times in ns since the start of the session, or
+            LOST. Sample m is stored at index m modulo its length.
         points: Delay traces and outages of all links of the receiver.
     """
     kept = dues.shape[0]

@@ -1,15 +1,15 @@
 """Computes the delay of each message in a simulated network.
 
 A delay model is a distribution of delays, a function of time, or a recorded trace. The messages
-are samples: in each control period, an arm sends a sample with its state over a link to each
-other arm. The index of a sample is the number of this period, and its stamp the time at which
-it was sent.
+are samples. The index of a sample is the number of the sender's control period, and its stamp
+is the time at which it was sent.
 
 Invariant (law L4 of docs/develop/design.md):
-    - A delay depends only on the seed of the link and on the index and the stamp of the sample.
-      Therefore a run can be repeated exactly. Delays are rounded to whole microseconds.
-    - Only the model AR1, with correlated delays, also depends on the previous sample. It
-      processes the samples in the order in which they were sent, not in which they arrive.
+    - A delay depends only on the seed of the link and on the index and stamp of the sample, so
+      a run can be repeated exactly. Delays are rounded to whole microseconds.
+    - The only exception is the model AR1, whose correlated delays also depend on the previous
+      sample. It processes samples in the order in which they were sent, not in order of
+      arrival.
 """
 
 import math
@@ -26,26 +26,26 @@ from ..step.vectors import Points, Row, count_started
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
 
 MAX_DELAY_US = 10_000_000
-"""Largest delay. Longer delays from a random distribution are cut off at this value."""
+"""Largest delay. Longer delays drawn from a distribution are clipped to this value."""
 
 
 class DelayKind(IntEnum):
-    """The kinds of delay, with the meaning of the four parameters of a `LinkModel`.
+    """Types of delay, which determine the meaning of the four parameters of a `LinkModel`.
 
     Times are in us.
 
     - CONSTANT: location.
     - UNIFORM: from location - scale to location + scale.
-    - NORMAL: mean `location`, deviation `scale`; negative draws are repeated.
+    - NORMAL: mean `location`, standard deviation `scale`; negative draws are repeated.
     - GAMMA: shape `extra`, scale `scale`.
-    - LOG_NORMAL: exponential of a normal random number with mean `location` and deviation
+    - LOG_NORMAL: exponential of a normal variable with mean `location` and standard deviation
       `scale`.
-    - HYPER_EXPONENTIAL: `location` plus a random number with an exponential distribution. Its
-      mean is `extra` with the probability `weight`, and `scale` otherwise.
-    - AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample; cut
-      off at zero.
+    - HYPER_EXPONENTIAL: `location` plus an exponentially distributed variable. Its mean is
+      `extra` with probability `weight`, and `scale` otherwise.
+    - AR1: mean `location`, standard deviation `scale`, correlation `weight` between successive
+      samples; clipped at zero.
     - SINE: location + scale sin(2 pi t / extra + weight).
-    - TRACE: a table of delays by time.
+    - TRACE: a table of delays over time.
     - MEASURED: no delay is injected; a sample is used as soon as it arrives.
     - CUSTOM: a compiled function in a file of its own; never above `location`.
     """
@@ -64,7 +64,7 @@ class DelayKind(IntEnum):
 
 
 class TraceEnd(IntEnum):
-    """How a recorded delay trace, a table of delays by time, continues after its last entry.
+    """How a recorded delay trace continues after its last entry.
 
     It either holds the last delay or starts again from the first.
     """
@@ -76,27 +76,27 @@ class TraceEnd(IntEnum):
 class LinkModel(NamedTuple):
     """Model of a network link: how long it delays messages, and how many it loses.
 
-    It applies to messages that are sent at or after a given time, until the next model applies.
-    The time of sending is called the stamp of a message.
+    It applies to messages sent at or after a given time, until the next model takes effect. The
+    sending time of a message is called its stamp.
 
     Attributes:
         from_ns: First stamp to which the model applies, ns since the start of the session.
         kind: A `DelayKind`, which defines `location`, `scale`, `extra` and `weight`.
         at_end: A `TraceEnd`, for a trace.
-        trace_first: First row in the site's table of the points of a trace, or of the numbers
+        trace_first: First row in the site's table that holds the points of a trace, or the data
             of a CUSTOM model.
         trace_count: Number of these rows.
-        loss_good: Probability that a sample is lost in the good state.
-        loss_bad: Probability that a sample is lost in the bad state.
-        enter: Probability of a change from good to bad, per sample.
-        leave: Probability of a change from bad to good, per sample.
-        duplicate: Probability that a sample has a copy, with another delay.
-        in_order: 1: no sample is released before an older sample; 0: the newest sample counts.
+        loss_good: Probability of losing a sample in the good state.
+        loss_bad: Probability of losing a sample in the bad state.
+        enter: Probability per sample of changing from good to bad.
+        leave: Probability per sample of changing from bad to good.
+        duplicate: Probability that a sample is duplicated, with a different delay.
+        in_order: 1: no sample is released before an older one; 0: the newest sample is used.
         playout_us: Minimum delay of each sample, us (play-out buffer).
         call: Address of the function of a CUSTOM model, see `plugged`.
-        key: Input of that function: the key of the link.
-        sample: Input: the index of the sample.
-        stamp_ns: Input: the stamp of the sample, ns since the start of the session.
+        key: Input of that function: key of the link.
+        sample: Input: index of the sample.
+        stamp_ns: Input: stamp of the sample, ns since the start of the session.
         drawn_us: Output: the delay, us.
     """
 
@@ -124,7 +124,7 @@ class LinkModel(NamedTuple):
 
     @classmethod
     def follow_trace(cls, at_end: str) -> "LinkModel":
-        """Creates a model whose delays are those of a recorded trace.
+        """Creates a model that takes its delays from a recorded trace.
 
         Args:
             at_end: How the trace continues after its last entry: "hold" or "loop", see
@@ -134,7 +134,7 @@ class LinkModel(NamedTuple):
 
     @property
     def has_ending_trace(self) -> bool:
-        """True if the delays are those of a trace that does not start again at its end."""
+        """True if the delays follow a trace that does not start again at its end."""
         return self.kind == DelayKind.TRACE and self.at_end == TraceEnd.HOLD
 
 
@@ -153,23 +153,24 @@ _LARGEST_NORMAL = 8.6
 _LARGEST_EXPONENTIAL = 36.8
 """Largest magnitudes of random numbers.
 
-They occur at the smallest uniform number 2^-53 (see
-`unit_interval`): sqrt(-2 log 2^-53) by the method of Box and Muller, and -log 2^-53.
+They occur at the smallest uniform number 2^-53 (see `unit_interval`): sqrt(-2 log 2^-53) with
+the Box-Muller method, and -log 2^-53.
 """
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
     """Returns the longest delay that a delay model can produce, or an upper bound on it, us.
 
-    The bound follows from the bounds of the model's random numbers: the largest normal number
-    is `_LARGEST_NORMAL`, and the largest exponential number of mean 1 is
-    `_LARGEST_EXPONENTIAL`. The limit MAX_DELAY_US is not applied, except to the log-normal
-    delay, whose exponential might overflow.
+    The bound is derived from those of the model's random numbers: the largest normal number is
+    `_LARGEST_NORMAL`, and the largest exponential number with mean 1 is `_LARGEST_EXPONENTIAL`.
+    The limit MAX_DELAY_US is only applied to the log-normal delay, whose exponential might
+    overflow.
 
     Args:
-        model: The model. `DelayKind` states what its numbers `location`, `scale`, `extra` and
-            `weight` mean for each kind of delay.
-        trace: Points of its trace, rows of time and delay, see `Points`; None for other kinds.
+        model: The model. See `DelayKind` for the meaning of `location`, `scale`, `extra` and
+            `weight` for each type of delay.
+        trace: Points of its trace, as rows of time and delay, see `Points`. None for other
+            types.
     """
     location = model.location
     scale = model.scale
@@ -208,13 +209,13 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
     """Returns an upper bound on the delay of any message on a link, us.
 
-    The receiver reserves memory for as many waiting messages as this bound permits. The bound
-    includes the play-out buffer, a minimum delay that the receiver adds to reduce jitter.
+    It determines how much memory the receiver reserves for waiting messages. The bound includes
+    the play-out buffer, a minimum delay that the receiver adds to reduce jitter.
 
     Args:
-        models: The delay models that apply to the link, one after another.
-        traces: For each model its recorded trace, a table of delays over time. None for a model
-            without a trace.
+        models: Delay models that apply to the link, one after another.
+        traces: For each model, its recorded trace (a table of delays over time). None for a
+            model without a trace.
 
     Returns:
         The bound, us.
@@ -222,7 +223,7 @@ def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -
     bounds_us = []
     for model, trace in zip(models, traces, strict=True):
         longest_us = min(_longest_us(model, trace), MAX_DELAY_US)
-        # One more, because delays are rounded to whole microseconds.
+        # Add one, because delays are rounded to whole microseconds.
         rounded_us = math.ceil(longest_us) + 1
         bounds_us.append(max(rounded_us, model.playout_us))
     return min(MAX_DELAY_US, max(bounds_us))
@@ -234,8 +235,7 @@ DELAY = 2
 COPY = 5
 """Purposes of random draws.
 
-DELAY and COPY also reserve the two numbers that follow them, see
-`standard_gamma`.
+DELAY and COPY also reserve the two numbers after them, see `standard_gamma`.
 """
 
 _UNIFORM = int(DelayKind.UNIFORM)
@@ -250,16 +250,16 @@ _LOOP = int(TraceEnd.LOOP)
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
     """Draws a random delay from a distribution without memory, in us and not rounded.
 
-    The random numbers are a function of the key, the sample and the purpose. Therefore the same
-    arguments always give the same delay. `DelayKind` states what the parameters `location`,
-    `scale`, `extra` and `weight` of the model mean for each distribution.
+    The random numbers are a function of key, sample and purpose, so the same arguments always
+    give the same delay. `DelayKind` defines the model parameters `location`, `scale`, `extra`
+    and `weight` for each distribution.
 
     Args:
-        key: Key of the link, from which all its random numbers follow.
-        sample: Index of the sample, the state that an arm sends in one control period.
-        purpose: Selects random numbers that are independent of each other: DELAY for the
-            sample, COPY for its duplicate.
-        model: Model of the delay, a row of LINK_MODEL_DTYPE.
+        key: Key of the link, which determines all its random numbers.
+        sample: Index of the sample.
+        purpose: Selects independent random numbers: DELAY for the sample, COPY for its
+            duplicate.
+        model: Delay model, a row of LINK_MODEL_DTYPE.
 
     Returns:
         The delay. If the model has no such distribution, it is the constant `location`.
@@ -297,14 +297,14 @@ def _next_ar1_value(
 
         x_m = c x_{m-1} + sqrt(1 - c^2) n_m,  n_m standard normal
 
-    Delays that vary slowly from message to message follow such an AR(1) sequence. Each of its
-    numbers has the mean 0 and the deviation 1.
+    Used for delays that vary slowly from message to message. Each element of this AR(1)
+    sequence has mean 0 and standard deviation 1.
 
     Args:
-        key: Key of the link, from which all its random numbers follow.
+        key: Key of the link, which determines all its random numbers.
         sample: Index m of the sample.
         correlation: Correlation c of neighbours.
-        before: Number x_{m-1} of the previous sample.
+        before: Value x_{m-1} for the previous sample.
         fresh: True if the sequence starts here, with x_m = n_m.
     """
     draw = standard_normal(key, sample, DELAY, 0)
@@ -315,15 +315,15 @@ def _next_ar1_value(
 
 @leaf
 def _sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Computes the delay of a sample (message) on a link whose delay is a sine of time.
+    """Computes the delay of a sample on a link whose delay varies sinusoidally with time.
 
         delay(t) = mean + amplitude sin(2 pi t / period + phase)
 
     Args:
-        stamp_ns: Stamp of the sample, the time t at which it was sent, ns since the epoch, the
-            common start of the session.
-        model: Model of the delay, a row of LINK_MODEL_DTYPE. The mean is `location`, the
-            amplitude `scale` and the period `extra`, all in us. The phase is `weight`, in rad.
+        stamp_ns: Time t at which the sample was sent, ns since the epoch (the common start of
+            the session).
+        model: Delay model, a row of LINK_MODEL_DTYPE. The mean is `location`, the amplitude
+            `scale` and the period `extra`, all in us. The phase is `weight`, in rad.
 
     Returns:
         The delay, us, not rounded.
@@ -339,21 +339,18 @@ def _sine_delay_us(stamp_ns: int, model: Row) -> float:
 
 @leaf
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
-    """Returns the delay of a sample (message) on a link with a recorded trace of delays.
+    """Returns the delay of a sample on a link that follows a recorded delay trace.
 
-    A trace is a table of delays by time.
-
-    The last point at or before the time at which the sample was sent gives the delay. A trace
-    that loops starts again after its last point, which lasts as long as the point before it.
+    The delay is read from the last point of the trace at or before the sending time. A trace
+    that loops starts again after its last point, which lasts as long as the one before it.
 
     Args:
-        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the start of the
-            session.
-        model: Model of the delay, a row of LINK_MODEL_DTYPE.
-        points: Points of all traces, rows of time and delay, us.
+        stamp_ns: Time at which the sample was sent, ns since the start of the session.
+        model: Delay model, a row of LINK_MODEL_DTYPE.
+        points: Points of all traces, as rows of time and delay, us.
 
     Returns:
-        The delay, us. It is -1 if the sample is lost.
+        The delay, us, or -1 if the sample is lost.
     """
     first = model.trace_first
     count = model.trace_count
@@ -370,15 +367,14 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
 
 @leaf
 def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
-    """Returns two uniform random numbers for a delay model that a user wrote.
+    """Returns two uniform random numbers for a user-written delay model.
 
-    Equal arguments give equal numbers, in every process. Therefore a run can be repeated
-    exactly.
+    The same arguments give the same numbers in every process, so a run can be repeated exactly.
 
     Args:
-        now: The argument that the user's function received, with the seed of the link.
-        index: Index of the draw. Usually it is the index of the sample whose delay is computed.
-        attempt: Counts the draws for one index from 0, for methods that reject some draws.
+        now: The argument passed to the user's function, which contains the seed of the link.
+        index: Index of the draw, usually the index of the sample whose delay is computed.
+        attempt: Attempt for this index, starting at 0, for methods that reject some draws.
     """
     return uniforms(np.uint64(now.key), index, DELAY, attempt)
 
@@ -387,26 +383,26 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def _custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Computes the delay of a message by the compiled function of a user's model, us.
+    """Computes the delay of a message with the compiled function of a user's model, us.
 
-    The delay is limited to the maximum that the user's model declares. The function has two
+    The delay is limited to the maximum that the user's model declares. The function takes two
     arguments: the parameters of the user's model, and the data of the delay model. From the
-    latter, it reads the fields `key`, `sample` and `stamp_ns`, and writes the delay into the
+    latter, it reads the fields `key`, `sample` and `stamp_ns`, and it writes the delay to the
     field `drawn_us`, see `plugged`.
 
     Args:
         key: Seed of all random numbers of the link.
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        model: The delay model, a row of LINK_MODEL_DTYPE. The field `call` is the address of
-            the function. The field `location` is the maximum delay, us.
+        model: Delay model, a row of LINK_MODEL_DTYPE. The field `call` is the address of the
+            function, and `location` is the maximum delay, us.
         points: Table with the parameters of all models: floats stored in an array of integers,
             two per row.
 
     Returns:
         The delay in us, not rounded.
     """
-    # The key is an unsigned number, the field a signed one with the same bits.
+    # The key is unsigned, whereas the field is signed, with the same bits.
     model.key = np.int64(key)
     model.sample = sample
     model.stamp_ns = stamp_ns
@@ -421,9 +417,9 @@ def _custom_delay_us(
 
 @leaf
 def clamp_delay_us(delay_us: float) -> int:
-    """Returns a delay rounded to whole microseconds and limited to 0 to `MAX_DELAY_US`.
+    """Rounds a delay to whole microseconds and clips it to the range 0 to `MAX_DELAY_US`.
 
-    A random distribution such as the normal one can give a negative delay, which becomes 0.
+    A random distribution such as the normal one can produce a negative delay, which becomes 0.
     """
     rounded_us = math.floor(delay_us + 0.5)
     return int(min(max(rounded_us, 0.0), float(MAX_DELAY_US)))
@@ -442,15 +438,14 @@ def find_delay_us(
 ) -> int:
     """Returns the delay of a message on a simulated network link, us.
 
-    The delay may follow a distribution, a function of time, or a recorded trace, see
-    `DelayKind`. The result is `channel.LOST` if the trace says that the message is lost. A
-    message (sample) is the state that another arm sends in one control period.
+    The delay may follow a distribution, a function of time, or a recorded trace; see
+    `DelayKind`. The result is `channel.LOST` if the trace marks the message as lost.
 
     Args:
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        fresh: True for the first sample of the model, with which the model's state starts.
-        link: State of the link, with the seed of its random numbers.
+        fresh: True for the first sample of the model, which initialises the model's state.
+        link: State of the link, including the seed of its random numbers.
         model: Delay model in force, a row of LINK_MODEL_DTYPE.
         points: Delay traces and outages of all links of the receiver.
     """

@@ -1,25 +1,24 @@
 """Computes the position that an arm follows: a weighted mean of the positions of other arms.
 
-Each arm is controlled by a process called a site. Site i follows site j with the weight
-alpha_ij, which is called dominance factor or share. If two users with the factors 0.7 and 0.3
-lead a slave, the slave follows 0.7 q_1 + 0.3 q_2, where q_j is the position of arm j. This sum
-is called the reference of the slave.
+Site i follows site j with weight alpha_ij, called the dominance factor or share. If two users
+with factors 0.7 and 0.3 lead a slave, the slave follows 0.7 q_1 + 0.3 q_2, where q_j is the
+position of arm j. This sum is the reference of the slave.
 
-In the stability proof, the matrix Upsilon = I - alpha describes the coupling, with the identity
-I. The energy function of the proof weights site i with the number beta_i.
+In the stability proof, the coupling is described by the matrix Upsilon = I - alpha, where I is
+the identity. The energy function of the proof weights site i by beta_i.
 
 Invariant:
     - Each row of the matrix alpha sums to 1, and its diagonal is zero.
     - beta is the LEFT null vector of Upsilon.
-    - Factors change along ramps. Every row sums to 1 during a ramp too. The factors at a time
-      depend only on this time and the ramps.
+    - Factors change along ramps. Every row also sums to 1 during a ramp. The factors at a given
+      time depend only on this time and the ramps.
     - If samples from another site stop arriving, the reference stops. It later returns smoothly
       from the held pose along the polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
 
 Source: Eq. (6), (7), (20) of the paper on which this project is based
 (docs/reference/references.md). The paper uses beta = (1, 1, 1). This is the right null vector
-of Upsilon, and a left null vector only if the columns sum to 1 as well. The left null vector of
-an irreducible matrix is its Perron vector, which is positive and unique up to its length.
+of Upsilon, and is a left null vector only if the columns also sum to 1. The left null vector of
+an irreducible matrix is its Perron vector, which is positive and unique up to scaling.
 """
 
 import numpy as np
@@ -36,18 +35,18 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 class DominanceMatrix:
-    """Matrix of the dominance factors alpha_ij, with which N sites follow each other.
+    """Matrix of the dominance factors alpha_ij with which N sites follow each other.
 
-    Site i follows site j, with the weight alpha_ij, if alpha_ij is above 0.
+    Site i follows site j, with weight alpha_ij, if alpha_ij is positive.
 
     Args:
-        alpha: The factors, shape (N, N): row i contains the weights with which site i follows
-            the other sites.
+        alpha: Dominance factors, shape (N, N). Row i contains the weights with which site i
+            follows the other sites.
 
     Attributes:
-        alpha: The value of the argument.
-        reach: Shape (N, N): true at [i, j] if i = j, or if site i follows site j, directly or
-            through other sites.
+        alpha: The dominance factors passed to the constructor.
+        reach: Boolean array of shape (N, N), True at [i, j] if i = j, or if site i follows site
+            j directly or through other sites.
     """
 
     def __init__(self, alpha: Array) -> None:
@@ -62,25 +61,25 @@ class DominanceMatrix:
     def is_irreducible(self) -> bool:
         """True if every site follows every other site, directly or through others.
 
-        The stability theorem needs this property.
+        The stability theorem requires this property.
         """
         return bool(self.reach.all())
 
     def find_closed_groups(self) -> tuple[tuple[int, ...], ...]:
-        """Finds the groups of sites that follow each other, and no site outside the group.
+        """Finds groups of sites that follow each other, but no site outside their group.
 
         If there are several groups, the weights of the sites in the energy function V are not
         unique.
 
         Returns:
-            Indices of the sites of each group.
+            Indices of the sites in each group.
         """
         reach = self.reach
         groups = []
         for site in range(len(reach)):
             is_mutual = reach[site] & reach[:, site]
             group = tuple(np.flatnonzero(is_mutual).tolist())
-            # The first site of a group stands for the group.
+            # The first site of a group represents the group.
             is_first = group[0] == site
             is_closed = reach[site].sum() == len(group)
             if is_first and is_closed:
@@ -90,12 +89,12 @@ class DominanceMatrix:
     def find_balancing_weights(self) -> Array | None:
         """Returns weights D > 0 with D_i alpha_ij = D_j alpha_ji, if the matrix is reversible.
 
-        With such weights the matrix is similar to a symmetric one, so that its eigenvalues are
-        real. Some stability conditions hold only then. The equation is called detailed balance.
-        It has a solution if the products of the dominance factors around each cycle of sites
-        are equal in both directions (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13
-        alpha32 alpha21 for three sites. Links that leave a group of sites that all reach each
-        other are part of no cycle, and are ignored.
+        With such weights, the matrix is similar to a symmetric one, so its eigenvalues are
+        real. Some stability conditions hold only in this case. The equation is called detailed
+        balance. It has a solution if the products of the dominance factors around each cycle of
+        sites are equal in both directions (Kolmogorov's criterion), for example alpha12 alpha23
+        alpha31 = alpha13 alpha32 alpha21 for three sites. Links that leave a group of mutually
+        reachable sites belong to no cycle and are ignored.
 
         Returns:
             D, shape (N,), with D = 1 at the first site of each group. None if no D exists.
@@ -106,7 +105,8 @@ class DominanceMatrix:
         for first in range(len(alpha)):
             if D[first]:
                 continue
-            # The first site of a group: the balance with its neighbours gives their weights.
+            # Start at the first site of a group: the balance with its neighbours determines
+            # their weights.
             D[first] = 1.0
             unvisited = [first]
             while unvisited:
@@ -137,11 +137,10 @@ class DominanceMatrix:
     def find_beta(self) -> Array:
         """Returns the weights beta of the sites in the energy function of the proof.
 
-        They are the positive solution of beta' = beta' alpha with the sum 1, which the paper
-        writes as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and
-        Heyman (1985). It contains no subtraction. Therefore each entry is accurate to a few
-        units in the last place even if the dominance factors differ by many orders of
-        magnitude.
+        They are the positive solution of beta' = beta' alpha whose sum is 1 (beta' Upsilon = 0
+        in the paper's notation). The method is the elimination of Grassmann, Taksar and Heyman
+        (1985), which uses no subtractions. Each entry is therefore accurate to a few units in
+        the last place even if the dominance factors differ by many orders of magnitude.
 
         Returns:
             The weights, shape (N,).
@@ -169,12 +168,12 @@ class DominanceMatrix:
         return normalised
 
     def find_pi(self) -> Array:
-        """Returns the left eigenvector pi for the eigenvalue 1, also of a reducible matrix.
+        """Returns the left eigenvector pi for the eigenvalue 1, even of a reducible matrix.
 
-        The vector satisfies pi >= 0 and pi' alpha = pi', and its sum is 1. pi is 0 for sites
-        outside closed groups, see `find_closed_groups`. With several closed groups pi is not
-        unique: the sum of its entries in each group is then chosen proportional to the number
-        of sites in the group.
+        The vector satisfies pi >= 0 and pi' alpha = pi', and its entries sum to 1. pi is 0 for
+        sites outside closed groups, see `find_closed_groups`. With several closed groups, pi is
+        not unique; the sum of its entries in each group is then chosen proportional to the
+        number of sites in the group.
 
         Returns:
             The vector, shape (N,).
@@ -200,10 +199,9 @@ end, ns, followed by the dominance factor of each peer at its end.
 def _interpolate(
     t_ns: float, start_ns: float, end_ns: float, before: float, after: float
 ) -> float:
-    """Returns a weight at time t during its linear change from `before` to `after`.
+    """Returns a dominance factor at time t during its linear change from `before` to `after`.
 
-    The weight (dominance factor) states how much an arm follows another. It is `after` once the
-    change has ended.
+    The factor stays at `after` once the change has ended.
 
     Args:
         t_ns: Time t, ns since the start of the session.
@@ -220,18 +218,17 @@ def _interpolate(
 
 @leaf
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
-    """Computes the weights with which an arm follows the others, and their rates, at time t.
+    """Computes the dominance factors of an arm's links, and their derivatives, at time t.
 
-    The weights are called dominance factors, one per network link. They change by ramps, which
-    are linear in time. A ramp starts at the factors that the previous ramp has reached by then,
-    even if that ramp is not complete.
+    The factors change along ramps, which are linear in time. A ramp starts at the factors that
+    the previous ramp has reached by then, even if that ramp is not complete.
 
     Args:
-        t_ns: The time, ns since the epoch, the common start of the session.
-        count: Number of filled rows of `ramps`.
-        ramps: Ramps in the order of their starts, shape (R, RAMP_COLUMNS + P); row 0 holds
-            the factors at the epoch.
-        links: State of each link, one row per peer, shape (P,); written.
+        t_ns: The time, ns since the epoch (the common start of the session).
+        count: Number of rows of `ramps` in use.
+        ramps: Ramps ordered by start time, shape (R, RAMP_COLUMNS + P). Row 0 holds the factors
+            at the epoch.
+        links: State of each link, one row per peer, shape (P,); updated in place.
     """
     for j in range(links.shape[0]):
         link: LinkRow = links[j]
@@ -263,14 +260,13 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
 
 
 def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
-    """Removes old changes of the dominance factors from a table, to make room for new changes.
+    """Removes old ramps of the dominance factors from a table, to make room for new ones.
 
-    The dominance factors are the weights with which an arm follows the other arms. Each change
-    is a ramp in time. The last ramp that has started is kept, because it may still be in
-    progress. Its start values are stored in row 0. Therefore `apply_ramps` computes exactly the
-    same factors as before for `t_ns` and all later times.
+    The last ramp that has started is kept, because it may still be in progress, and its initial
+    values are stored in row 0. For `t_ns` and all later times, `apply_ramps` therefore computes
+    exactly the same factors as before.
 
-    The table changes as follows, if m is the row of the last ramp that has started:
+    If m is the row of the last ramp that has started, the table changes as follows:
 
         row 0                   factors at the start of the session
                                 -> factors at the start of ramp m
@@ -278,20 +274,20 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
         rows m to count - 1     -> rows 1 to count - m
 
     Args:
-        t_ns: Present time, ns since the start of the session.
-        count: Number of filled rows of `ramps`.
-        ramps: Ramps in the order of their starts, shape (R, RAMP_COLUMNS + P) for P peers;
-            changed in place. A row contains the start and the end of a ramp, ns, and the P
-            factors at its end.
+        t_ns: Current time, ns since the start of the session.
+        count: Number of rows of `ramps` in use.
+        ramps: Ramps ordered by start time, shape (R, RAMP_COLUMNS + P) for P peers; updated in
+            place. A row contains the start and the end of a ramp, ns, and the P factors at its
+            end.
 
     Returns:
-        The number of rows that are left.
+        The number of rows still in use.
     """
     last_started = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
     if last_started < 2:
         return count  # no ramp is older than the last ramp that has started
 
-    # The factors at the start of the current ramp, from ramp to ramp.
+    # Compute the factors at the start of the current ramp, going from ramp to ramp.
     factors = ramps[0, RAMP_COLUMNS:].copy()
     current = 0
     for following in range(1, last_started + 1):
@@ -323,10 +319,10 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """Returns True if this arm has no recent state from an arm that it follows.
+    """Returns True if this arm has no recent sample from an arm that it follows.
 
-    That is, the message in use from the other arm was sent too long ago. If no message has
-    arrived yet, the time counts from the common start of the session.
+    This means that the sample in use was sent too long ago. If no sample has arrived yet, its
+    age is counted from the common start of the session.
 
     Args:
         t_ns: Time, ns since the epoch.
@@ -343,21 +339,20 @@ def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 @leaf
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Stops an arm while another arm that it follows is silent, and resumes afterwards.
+    """Stops an arm while a peer that it follows is silent, and resumes afterwards.
 
-    The reference is the position that the arm follows, and a peer an arm that it follows. A
-    peer is silent if its last sample (sent state) is too old. In mode HOLD the reference stays
-    where it was. In BRAKE it is the pose that the arm had when the peer fell silent. In RETURN
-    the reference moves smoothly back to the position q_des computed from the peers:
+    A peer is silent if its last sample is too old. In mode HOLD, the reference stays where it
+    was. In BRAKE, it is the pose that the arm had when the peer fell silent. In RETURN, it
+    moves smoothly back to the position q_des computed from the peers:
 
         reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
 
-    Here q_held is the reference before the return, and x the elapsed fraction of the time
+    Here q_held is the reference before the return, and x is the elapsed fraction of the time
     `return_ns`, from 0 to 1.
 
     Args:
         t_ns: Time, ns since the start of the session.
-        site: State of the site (the process that runs the arm), with q_des; changed.
+        site: State of the site, including q_des; updated in place.
         links: State of each link from another site, one row per link.
     """
     if site.on_stale == _USE or site.mode == _DIVERGED:
@@ -395,27 +390,24 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) -> None:
-    """Computes the position that an arm follows, a weighted mean of the other arms' positions.
-
-    The other arms are its peers, which send samples (their states). The position is called the
-    reference:
+    """Computes the reference of an arm, a weighted mean of the positions of its peers.
 
         q_des  = sum_j alpha_ij q_j                                  Eq. (6)
         qd_des = sum_j (alpha_ij qd_j + alpha_ij' q_j)
         felt   = -sum_j alpha_ij tau_x_j
 
-    Here q_j, qd_j and tau_x_j are the position, velocity and exogenous torque in the sample of
-    peer j, alpha_ij is the weight of this peer and alpha_ij' its derivative. `felt` is the
-    torque of operators and environments on the peers' arms. The terms are added in scenario
-    order, because another order would change the last bits of the sums.
+    Here q_j, qd_j and tau_x_j are the position, velocity and external torque in the sample from
+    peer j, alpha_ij is the dominance factor of this peer and alpha_ij' its derivative. `felt`
+    is the torque of operators and environments on the peers' arms. Terms are added in scenario
+    order, since any other order would change the last bits of the sums.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site (the process that runs the arm); written.
+        t_ns: Time, ns since the epoch (the common start of the session).
+        site: State of the site; updated in place.
         links: State of each link from another site, one row per link.
         ramps: Changes of the dominance factors, see `apply_ramps`.
     """
-    # Row 0 of the ramps has the factors at the start, which apply if there is no other row.
+    # Row 0 of the ramps contains the initial factors, which apply if there is no other row.
     if site.ramps > 1 or site.degrades:
         apply_ramps(t_ns, site.ramps, ramps, links)
     if site.degrades:

@@ -1,22 +1,22 @@
-"""Holds each received message until the delay of the simulated network has passed.
+"""Holds each received message until its delay in the simulated network has passed.
 
-In each control period (tick), an arm sends a sample, its state, to each other arm. A real
-network may be faster than the network that an experiment emulates. Therefore the receiver keeps
-a sample until its due time: the time at which it was sent, plus the simulated delay.
+The real network may be faster than the network that an experiment emulates. The receiver
+therefore holds each sample until its due time, which is the sending time plus the simulated
+delay.
 
-The samples wait in a ring buffer with one page for each of the next ticks of the receiver,
-called the calendar. `accept_sample` writes a sample into the page of the tick that will use it,
-unless this page holds a newer sample. `release_sample` reads the page of the present tick. Both
+Samples wait in a ring buffer called the calendar, which has one page for each of the receiver's
+next ticks. `accept_sample` writes a sample to the page of the tick that will use it, unless
+that page already holds a newer one. `release_sample` reads the page of the current tick. Both
 take the same time for any delay. Due times are kept longer than samples, for as long as a late
 sample or a duplicate may arrive.
 
 Invariant (law L2 of docs/develop/design.md):
-    - The due time of a sample is an integer in ns. It follows from the time at which the sample
-      was sent, and from the link's model of delay and loss. The sample is used from the
-      receiver's first tick at or after its due time, but never at the time when it was sent.
-    - The actual arrival has no influence if it is before the due time. On a link without a
+    - The due time of a sample is an integer in ns. It follows from the sending time and from
+      the delay and loss model of the link. The sample is used from the receiver's first tick at
+      or after its due time, but never at the time when it was sent.
+    - The actual arrival time is irrelevant if it is before the due time. On a link without a
       simulated delay, a sample is used as soon as it arrives.
-    - The newest sample wins: an older sample never replaces a newer sample.
+    - The newest sample wins: an older sample never replaces a newer one.
 """
 
 from functools import cache
@@ -36,10 +36,11 @@ from .delay import MAX_DELAY_US, DelayKind
 def link_dtype(shared: int) -> np.dtype[np.void]:
     """Returns the NumPy structured data type for the state of a network link, see `LinkRow`.
 
-    A link is the one-way connection from another arm. There is one array element per link.
+    There is one array element per link.
 
     Args:
-        shared: Number of coordinates that sites share, the length of the row's vectors.
+        shared: Number of coordinates that sites share, which is the length of the row's
+            vectors.
     """
     return row_dtype("link", {"shared": shared})
 
@@ -48,7 +49,7 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
 def sample_dtype(shared: int) -> np.dtype[np.void]:
     """Returns the NumPy data type of a message that waits until its simulated delay has passed.
 
-    A message (sample) is the state that another arm's process sends, see `SampleRow`.
+    The fields are those of `SampleRow`.
 
     Args:
         shared: Number of coordinates of a sample: joint angles, or coordinates of the end
@@ -58,18 +59,18 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """Arrays of the values that the control law of another arm sends, such as energies.
+    """Arrays of values that the control law of another arm sends, such as energies.
 
-    C is the number of values. They are in the order in which the law of this arm reads them.
-    Arrays for several senders or receivers have additional leading axes.
+    There are C values, in the order in which the law of this arm reads them. Arrays for several
+    senders or receivers have additional leading axes.
 
     Attributes:
-        waiting: Values that arrived with samples whose simulated delay has not passed yet, one
-            row per entry of the ring buffer `LinkArrays.calendar`, shape (pages, C).
-        received: Values that arrived with the sample in use, shape (C,). Zeros before the first
+        waiting: Values received with samples whose simulated delay has not passed yet, one row
+            per entry of the ring buffer `LinkArrays.calendar`, shape (pages, C).
+        received: Values received with the sample in use, shape (C,). Zeros before the first
             sample.
-        columns: Index of each value among all values that arrive with a sample, shape (C,). The
-            index is -1 for a value that the other law does not send; that value is 0.
+        columns: Index of each value among all values received with a sample, shape (C,), or -1
+            for a value that the other law does not send; that value is 0.
     """
 
     waiting: Array
@@ -80,20 +81,19 @@ class ChannelArrays(NamedTuple):
 class LinkArrays(NamedTuple):
     """Arrays that hold the state of one network link, for compiled code.
 
-    A link is the one-way connection over which an arm's process receives the states of another
-    arm. Messages wait here until their simulated delay has passed.
+    Messages from the peer wait here until their simulated delay has passed.
 
     Attributes:
         state: State of the link, shape (1,), see `link_dtype`.
-        models: Models of the link's delay and loss, in the order in which they come into force.
-        dues: Times at which the newest samples (states of the other arm) are to be delivered,
-            in ns since the start of the session. LOST for a lost sample. This is a ring buffer:
-            sample m is at index m modulo the length. After the arrival of the sample, the entry
-            becomes `_FILED` minus the time.
+        models: Delay and loss models of the link, in the order in which they take effect.
+        dues: Times at which the newest samples are to be delivered, in ns since the start of
+            the session, or LOST for a lost sample. This is a ring buffer: sample m is at index
+            m modulo the length. After the sample has arrived, the entry becomes `_FILED` minus
+            the time.
         calendar: Ring buffer of the samples whose delay has not passed, see `sample_dtype`.
         points: Traces and outages of all links of the receiver, shape (n, 2).
-        channel: Further values that the other control law sends. None if the law of the
-            receiver does not read them.
+        channel: Additional values sent by the peer's control law. None if the receiver's law
+            does not read them.
     """
 
     state: RowArray
@@ -113,20 +113,21 @@ _MEASURED = int(DelayKind.MEASURED)
 
 
 _FILED = LOST - 1
-"""Marks samples that have arrived: due times are never negative, so `_FILED - due` is at most
-this, and LOST is above it.
+"""Marks samples that have arrived.
+
+Due times are never negative, so `_FILED - due` never exceeds this value, and LOST is above it.
 """
 
 
 def span_ticks(span_ns: int, rate_hz: int) -> int:
-    """Returns how many control periods (ticks) a duration takes, rounded up.
+    """Converts a duration to a number of ticks, rounded up.
 
-    For example, 2.5 ms take 3 ticks of a loop at 1000 Hz. The result is that of
+    For example, 2.5 ms take 3 ticks of a loop at 1000 Hz. The result is the same as that of
     `first_tick_at`, but this function is plain Python, for callers that have not loaded the
     compiled code.
 
     Args:
-        span_ns: The time, ns.
+        span_ns: The duration, ns.
         rate_hz: Tick rate, Hz.
     """
     return -(-span_ns * rate_hz // NS_PER_S)
@@ -135,19 +136,18 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
 def calendar_pages(
     rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
 ) -> int:
-    """Returns the number of entries in the ring buffer in which delayed messages wait.
+    """Returns the number of pages in a calendar, the ring buffer that holds delayed messages.
 
-    The buffer is called the calendar, and its entries pages. There is one page for each control
-    period of the receiver in which a message may first be used. The default arguments give the
-    largest number that any network link needs.
+    There is one page for each control period of the receiver in which a message may first be
+    used. The default arguments give the largest number that any network link needs.
 
     Args:
         rate_hz: Rate of the receiver's control loop, Hz.
         delay_us: Longest delay, us.
-        ahead_ns: Longest time by which the clock of a sender may be ahead of the receiver, ns.
+        ahead_ns: Longest time by which a sender's clock may be ahead of the receiver's, ns.
 
     Returns:
-        The number of pages, a power of two, so that a modulo is a mask of the lower bits.
+        The number of pages. It is a power of two, so that a modulo is a bit mask.
     """
     longest_wait_ticks = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
     # Two ticks more: the present tick, and a reserve of one tick for rounding.
@@ -158,23 +158,20 @@ def calendar_pages(
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
-    """Computes the control period of the receiver in which a message is first used.
-
-    A message (sample) is the state that a sender publishes in one period of its own loop.
+    """Computes the control period of the receiver in which a sample is first used.
 
     Args:
-        tick: Number of the period in which the sample was sent.
+        tick: Tick in which the sample was sent.
         rate_hz: Rate of the receiver's control loop, Hz.
         link: Arrays of the link.
 
     Returns:
-        The number of the receiver's period, if the sample arrives in time. LOST if the link
-        loses the sample, or if the sample is so old that its delivery time is no longer stored.
+        The receiver's tick, if the sample arrives in time. LOST if the link drops the sample,
+        or if the sample is so old that its delivery time is no longer stored.
     """
     row: LinkRow = link.state[0]
     dues = link.dues
-    # Compute the due times (times of delivery) up to this sample, unless they are known
-    # already.
+    # Compute the due times (delivery times) up to this sample, unless they are already known.
     schedule_deliveries(
         sample=tick, link=row, models=link.models, dues=dues, points=link.points
     )
@@ -202,7 +199,7 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
     be wrong.
 
     Args:
-        k: Present tick of the receiver.
+        k: Current tick of the receiver.
         rate_hz: Tick rate of the receiver, Hz.
         tick: Tick of the sender in which it sent the sample.
         peer_rate_hz: Tick rate of the sender, Hz.
@@ -215,15 +212,15 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Stores the values that the control law of another arm has sent, until they may be used.
+    """Stores the values sent by another arm's control law until they may be used.
 
-    The values, for example an energy, arrived in the same message as the state of the other
+    The values (for example, an energy) arrived in the same message as the state of the other
     arm. They wait with that state until the simulated delay of the message has passed.
 
     Args:
-        channel: Arrays of these numbers; None if the receiver's law ignores them.
-        page: Index of the entry of the ring buffer in which the sample waits.
-        sent: The values that arrived, in the order of the sender.
+        channel: Arrays of these values; None if the receiver's law ignores them.
+        page: Index of the ring buffer entry in which the sample waits.
+        sent: The values that arrived, in the order used by the sender.
     """
     if channel is None:
         return
@@ -234,14 +231,14 @@ def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
-    """Gives the control law of this arm the values that the law of another arm has sent.
+    """Passes the values sent by another arm's control law to the control law of this arm.
 
-    The values, for example an energy, arrived in the same message as the state of the other
-    arm. The function is called when the simulated delay of this message has passed.
+    The values (for example, an energy) arrived in the same message as the state of the other
+    arm. This function is called when the simulated delay of that message has passed.
 
     Args:
-        channel: Arrays of these numbers; None if the receiver's law ignores them.
-        page: Index of the entry of the ring buffer in which the sample waited.
+        channel: Arrays of these values; None if the receiver's law ignores them.
+        page: Index of the ring buffer entry in which the sample waited.
     """
     if channel is not None:
         put(channel.received, channel.waiting[page])
@@ -258,28 +255,28 @@ def accept_sample(
     sent: Array,
     link: LinkArrays,
 ) -> None:
-    """Stores a message that arrived from another arm, until its simulated delay has passed.
+    """Stores a message that arrived from another arm until its simulated delay has passed.
 
-    A message (sample) is the state of the other arm. If it arrives after its delivery time, it
-    is used in the present control period, unless a newer message is in use. Messages that
-    cannot be used are counted as rejected, lost or duplicate.
+    A message that arrives after its delivery time is used in the current tick, unless a newer
+    one is already in use. Messages that cannot be used are counted as rejected, lost or
+    duplicate.
 
     Args:
-        k: Present tick, the number of the receiver's control period.
+        k: Current tick of the receiver.
         rate_hz: Rate of the receiver's control loop, Hz.
         tick: Tick of the peer in which it sent the sample.
         q: Joint angles or pose of the peer, rad or m.
         qd: Derivative of q.
         tau_x: External torque of the peer, N m; the torque ON its arm is the negative.
-        sent: Further values from the control law of the peer. They are ignored if the law of
-            the receiver does not read them.
-        link: Arrays of the link; written.
+        sent: Additional values from the peer's control law, ignored if the receiver's law does
+            not read them.
+        link: Arrays of the link; updated in place.
     """
     row: LinkRow = link.state[0]
     dues = link.dues
     calendar = link.calendar
     row.accepted += 1
-    # The times of delivery are computed up to the sample `row.scheduled`.
+    # Delivery times have been computed up to the sample `row.scheduled`.
     is_scheduled = tick <= row.scheduled
     if tick < 0 or (not is_scheduled and _is_far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
@@ -300,8 +297,8 @@ def accept_sample(
         if model.kind != _MEASURED:  # on a measured link every sample is due before it arrives
             row.late += 1
         release = k
-    # The driver has enlarged the calendar as far as `CalendarSizer` permits. A sample for which
-    # there is still no room is rejected.
+    # The driver has enlarged the calendar as far as `CalendarSizer` permits. A sample that
+    # still does not fit is rejected.
     if release - k >= calendar.shape[0]:
         row.refused += 1
         return
@@ -327,23 +324,22 @@ def accept_sample(
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     """Starts to use the newest message from another arm whose simulated delay has passed.
 
-    If no message is due in control period (tick) k, the previous message stays in use. The
-    function must be called once in each period of the receiver, in order. Otherwise, messages
-    that `accept_sample` stored would stay in the ring buffer (calendar), which has one page per
-    period.
+    If no message is due in tick k, the previous one stays in use. Must be called once per
+    control period of the receiver, in order. Otherwise, messages stored by `accept_sample`
+    would stay in the calendar, which has one page per period.
 
-    The delivery times of all messages that were sent up to the time t_k of the period are
-    computed here, so that the first message after a long silence costs no more than any other.
+    Delivery times are computed here for all messages sent up to the time t_k of the tick, which
+    ensures that the first message after a long silence costs no more than any other.
 
     Args:
         k: Tick of the receiver.
         rate_hz: Tick rate of the receiver, Hz.
-        link: Arrays of the link; written.
+        link: Arrays of the link; updated in place.
     """
     row: LinkRow = link.state[0]
     row.new = 0
     calendar = link.calendar
-    # The last tick of the peer that has begun by now.
+    # The last tick that the peer has started by now.
     peer_tick = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
     schedule_deliveries(
         sample=peer_tick, link=row, models=link.models, dues=link.dues, points=link.points

@@ -1,11 +1,10 @@
-"""Computes which messages of another arm a controller used, without the run.
+"""Computes which messages of another arm a site uses, without simulating the run.
 
-In each control period, an arm sends its state to the other arms. These messages are delayed and
-lost at random, but the random numbers follow from the key of the connection. They can therefore
-be drawn again.
+Messages are delayed and lost at random, but the random numbers are determined by the key of the
+link, so they can be drawn again.
 
 Invariant:
-    - The random numbers of a connection are the same as in a run.
+    - The random numbers of a link are the same as in a run.
 """
 
 from collections.abc import Sequence
@@ -26,18 +25,18 @@ _BLOCK = 8192
 class LinkSchedule:
     """Computes when each message on a simulated network link should arrive at the receiver.
 
-    Every arm's process sends its state (a sample) once per control period. The arrival times
-    follow from the delays and losses in the description of the experiment, and are computed by
-    the same function as during a run. Each delay model applies to messages that are sent at or
-    after its start time.
+    The arrival times follow from the delays and losses in the scenario, and are computed by the
+    same function as during a run. Each delay model applies to messages sent at or after its
+    start time.
 
     Args:
-        setup: Setup of the link, as the kernel reads it.
-        changed_models: Models of delay and loss that the link gets by changes during the run.
+        setup: Setup of the link, as read by the kernel.
+        changed_models: Delay and loss models that the link acquires through changes during the
+            run.
 
     Attributes:
-        models: All models of the link, in the order of their start times.
-        row: State of the link: a row of the array that the kernel reads.
+        models: All models of the link, ordered by start time.
+        row: State of the link, as a row of the array that the kernel reads.
     """
 
     def __init__(self, setup: LinkSetup, changed_models: Sequence[LinkModel] = ()) -> None:
@@ -70,14 +69,13 @@ class LinkSchedule:
     def draw(self, end: int) -> IntArray:
         """Computes when the next messages of the link are due at the receiver.
 
-        The first of these messages is the one after the last message of the previous call.
+        Continues with the message after the last one of the previous call.
 
         Args:
-            end: Number of the sample after the last one.
+            end: Number of the sample at which to stop (exclusive).
 
         Returns:
-            Due times in ns after the epoch, one per sample. A sample that is lost has the value
-            LOST.
+            Due times in ns since the epoch, one per sample, or LOST for a lost sample.
         """
         first = int(self.row.scheduled) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
@@ -95,18 +93,18 @@ class LinkSchedule:
         return due_ns
 
     def draw_releases(self, end: int, receiver_hz: int) -> tuple[IntArray, IntArray]:
-        """Computes when the next messages of the link are used by the receiver.
+        """Computes when the next messages of the link are first used by the receiver.
 
-        A message is used in the first control period of the receiver that begins at or after
-        its arrival. Lost messages are left out.
+        A message is used in the first control period of the receiver that starts at or after
+        its arrival. Lost messages are omitted.
 
         Args:
-            end: Number of the message before which the computation ends.
+            end: Number of the message at which to stop (exclusive).
             receiver_hz: Rate of the receiver's control loop, in Hz.
 
         Returns:
-            Two arrays of the same length: the numbers of the messages, and for each the number
-            of the receiver's control period in which it is first used.
+            Two arrays of the same length: the numbers of the messages, and the receiver's tick
+                in which each message is first used.
         """
         samples = np.arange(int(self.row.scheduled) + 1, end)
         due_ns = self.draw(end)
@@ -120,12 +118,12 @@ class LinkSchedule:
         """Computes which message is in use in each control period of the receiver.
 
         Args:
-            end: Number of the message before which the computation ends.
+            end: Number of the message at which to stop (exclusive).
             receiver_hz: Rate of the receiver's control loop, in Hz.
             ticks: Number of control periods of the receiver.
 
         Returns:
-            Numbers of the messages, shape (ticks,). -1 before the first message.
+            Message numbers, shape (ticks,), or -1 before the first message.
         """
         samples, releases = self.draw_releases(end, receiver_hz)
         newest = np.full(ticks, -1, dtype=np.int64)
@@ -134,14 +132,14 @@ class LinkSchedule:
         return np.maximum.accumulate(newest)
 
     def draw_run(self, receiver_hz: int, duration_s: float) -> IntArray:
-        """Computes which message is in use in each control period of a whole run.
+        """Computes which message is in use in each control period of a complete run.
 
         Args:
             receiver_hz: Rate of the receiver's control loop, in Hz.
             duration_s: Duration of the run, in s.
 
         Returns:
-            Numbers of the messages, shape (ticks,). -1 before the first message.
+            Message numbers, shape (ticks,), or -1 before the first message.
         """
         sent = round(duration_s * self.row.rate_hz)
         ticks = max(2, round(duration_s * receiver_hz))
@@ -149,15 +147,15 @@ class LinkSchedule:
 
     @staticmethod
     def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
-        """Returns the first control period of the receiver at or after each delivery time.
+        """Returns the receiver's first tick at or after each delivery time.
 
-        It is `first_tick_at` for an array of times.
+        This is the vectorised form of `first_tick_at`.
 
         Args:
-            due_ns: Times in ns after the epoch (the common start time).
+            due_ns: Delivery times in ns since the epoch (the common start time).
             rate_hz: Tick rate, in Hz.
 
         Returns:
-            Numbers of the ticks, one per time.
+            Tick numbers, one per delivery time.
         """
         return -(-due_ns * rate_hz // NS_PER_S)

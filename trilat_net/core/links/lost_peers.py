@@ -1,20 +1,19 @@
 """Lets an arm continue when another arm that it follows is lost.
 
-An arm follows several other arms, its peers, each with a certain weight (dominance factor). A
-peer is lost if no sample (received state) of it could be used for some time. The remaining
-peers then get its weight: a slave that followed two users with 0.7 and 0.3 follows the second
-user alone if the first user is lost.
+A peer is lost if no sample from it could be used for some time. Its weight (dominance factor)
+is then given to the remaining peers. For example, a slave that followed two users with 0.7 and
+0.3 follows the second user alone if the first one is lost.
 
 Invariant:
-    - All decisions follow from the samples in use and from the stored state of the site, the
-      process that controls the arm. Decisions are taken in each period of the control loop.
-    - A site only continues without a peer if the remaining sites all reach each other without
-      it, and if the site still follows another peer. Otherwise the arm stops.
-    - The reference, the position that the arm follows, never jumps. It moves smoothly to the
-      position of the remaining peers, and later back if the lost peer returns.
+    - All decisions depend only on the samples in use and the stored state of the site. They are
+      re-evaluated in each control period.
+    - A site continues without a peer only if the remaining sites can all reach each other
+      without it, and if the site still follows another peer. Otherwise, the arm stops.
+    - The reference never jumps. It moves smoothly to the position of the remaining peers, and
+      back again if the lost peer returns.
 
 The field `gone` of a link stores the state of the peer. It is 0 while the peer is present, and
--1 while the peer is lost. After the return of the peer, it is the time of the return, in ns
+-1 while the peer is lost. After the peer has returned, it is the time of its return, in ns
 since the start of the session.
 """
 
@@ -27,7 +26,7 @@ from ..step.ticks import LifeReason
 from ..step.vectors import RowArray
 
 BACK_NS = 250_000_000
-"""Time for which samples of a dropped peer must arrive before it gets its share again, ns."""
+"""How long samples from a dropped peer must arrive before it regains its share, ns."""
 
 _DROPPED = int(LifeReason.DROPPED)
 _RESTORED = int(LifeReason.RESTORED)
@@ -37,22 +36,21 @@ _RESTORED = int(LifeReason.RESTORED)
 def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if the site may continue without a peer that is lost.
 
-    A site is the process that runs one arm. Its peers are the other sites, from which it
-    receives samples. The remaining sites are this site and the peers whose samples still
-    arrive. This site must still follow at least one of them, and they must all reach each
-    other. A site reaches the sites that it follows, directly or through others.
+    The remaining sites are this site and the peers whose samples still arrive. This site must
+    still follow at least one of them, and they must all reach each other. A site reaches the
+    sites that it follows, directly or through others.
 
-    The remaining sites all reach each other if two sets contain all of them: the sites that
-    this site reaches, and the sites that reach this site. The sets grow from this site until
-    nothing can be added. A set of sites is an integer with one bit per site.
+    The remaining sites all reach each other if each of them is in both of two sets: the sites
+    that this site reaches, and the sites that reach this site. The sets are grown from this
+    site until nothing can be added. A set of sites is an integer with one bit per site.
 
     Args:
-        lost: Index of the peer that is lost.
-        t_ns: Time, ns since the epoch, the common start of the session.
+        lost: Index of the lost peer.
+        t_ns: Time, ns since the epoch (the common start of the session).
         site: State of the site.
         links: State of each link, one row per peer. `bit` is the bit of the peer, `followed`
-            the set of the sites that the peer follows, and `alpha` the weight with which this
-            site follows the peer.
+            the set of sites that the peer follows, and `alpha` the weight with which this site
+            follows the peer.
     """
     remaining = site.bit
     followed = 0  # the remaining sites that this site follows
@@ -82,26 +80,25 @@ def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
 def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if a returning peer turns the reference by at most the alignment limit.
 
-    The reference, the orientation that the arm follows, is a weighted mean of the orientations
-    of the other arms, its peers. With the rotation vector u_j from the orientation of peer j to
-    that of this arm, and the weight alpha_j, the mean over the present peers is
+    The reference orientation is a weighted mean of the peers' orientations. With the rotation
+    vector u_j from the orientation of peer j to that of this arm, and the weight alpha_j, the
+    mean over the present peers is
 
         mean = sum_j alpha_j u_j / sum_j alpha_j
 
-    The returning peer with the rotation vector u and the weight alpha changes it by
+    A returning peer with rotation vector u and weight alpha changes it by
 
         |u - mean| alpha / (sum_j alpha_j + alpha)
 
-    The turn between two orientations is at most as long as the difference of their rotation
-    vectors from the site's own orientation.
+    The angle between two orientations never exceeds the length of the difference of their
+    rotation vectors relative to the site's own orientation.
 
     Args:
         back: Index of the returning peer.
-        site: State of the site (the process that runs the arm), with its own pose x. The last
-            three coordinates of a pose are the rotation vector of its orientation, rad.
-            `align_limit` is the limit.
-        links: State of each link, one row per peer, with the pose q of the peer. `gone` is 0
-            for a present peer. The weights of the present peers must not all be 0.
+        site: State of the site, including its own pose x. The last three coordinates of a pose
+            are the rotation vector of its orientation, rad. `align_limit` is the limit.
+        links: State of each link, one row per peer, including the pose q of the peer. `gone` is
+            0 for a present peer. The weights of the present peers must not all be 0.
     """
     orientation = rotation_matrix(read_three(site.x[3:]))
     total = 0.0  # the sum of the weights of the present peers
@@ -128,16 +125,15 @@ def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
 def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
     """Returns True if a returning arm would move the reference only slightly.
 
-    The reference, the position that this arm follows, is the mean of the positions of the other
-    arms with their weights alpha. The limit of the alignment applies to each linear coordinate,
-    a position or a joint angle, and to the orientation as a whole.
+    The reference is the mean of the peers' positions, weighted by alpha. The alignment limit
+    applies to each linear coordinate (a position or a joint angle), and to the orientation as a
+    whole.
 
     Args:
         back: Index of the returning peer.
-        site: State of the site (the process that runs the arm), with the limit `align_limit`, m
-            or rad.
-        links: State of each link, one row per peer, with the position q of the peer. `gone` is
-            0 for a present peer. The weights of the present peers must not all be 0.
+        site: State of the site, including the limit `align_limit`, m or rad.
+        links: State of each link, one row per peer, including the position q of the peer.
+            `gone` is 0 for a present peer. The weights of the present peers must not all be 0.
     """
     if has_orientation(site) and not _is_orientation_near(back, site, links):
         return False
@@ -155,7 +151,7 @@ def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
         weighted_sum_with_peer = weighted_sum + link.alpha * link.q[i]
         reference_with_peer = weighted_sum_with_peer / (total + link.alpha)
         reference_without_peer = weighted_sum / total
-        # The comparison is false for NaN, which must not count as near.
+        # The comparison is false for NaN, so NaN is never near.
         is_within_limit = abs(reference_with_peer - reference_without_peer) <= site.align_limit
         if not is_within_limit:
             return False
@@ -164,16 +160,16 @@ def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
 
 @leaf
 def _redistribute_shares(links: RowArray) -> bool:
-    """Divides the weights of lost arms among the other arms that this arm follows.
+    """Distributes the dominance factors of lost peers among the remaining peers.
 
-    The weight of a followed arm (peer) is its dominance factor alpha. The present peers get the
-    factors of the lost peers in proportion to their own factors, so that the sum is 1 again:
+    The present peers get the factors of the lost peers in proportion to their own factors
+    alpha, which makes the sum 1 again:
 
         alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
 
     Returns:
-        True if the factors were redistributed. False if all other peers have the factor 0; the
-        factors are not changed then.
+        True if the factors were redistributed. False if all other peers have the factor 0, in
+        which case nothing is changed.
     """
     total = 0.0  # the sum of the factors of the present peers, and its derivative
     total_rate = 0.0
@@ -205,27 +201,27 @@ def _redistribute_shares(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Gives the weight of lost peers to the other peers, and returns it when they come back.
+    """Gives the weight of lost peers to the other peers, and restores it when they return.
 
-    A site is the process that runs one arm, and its peers are the other sites. A dominance
-    factor is the weight with which the site follows a peer. The factors of lost peers are
-    redistributed to the others. Before the call `alpha` of a link is the planned factor,
-    afterwards the factor in force.
+    Before the call, `alpha` of each link is its planned dominance factor; afterwards, it is the
+    factor in force.
 
     The field `gone` of a link is the state of its peer:
 
-    - 0: present. If the peer falls silent and can be spared, it becomes lost.
-    - -1: lost. When samples of the peer arrive again, the field becomes the time of its return.
+    - 0: present. If the peer falls silent and is dispensable, it becomes lost.
+    - -1: lost. When samples from the peer arrive again, the field becomes the time of its
+      return.
     - Above 0: time of the return, ns. If the peer falls silent again, it is lost again. After
-      BACK_NS it becomes present, if it is near enough for the reference not to move far.
+      BACK_NS it becomes present, provided that it is near enough for the reference not to move
+      far.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: State of the site; changed. `regrouped` becomes the reason if a peer was dropped
-            or restored in this tick, otherwise 0.
-        links: State of each link, one row per peer; changed. A peer is silent if its last
-            sample came into use more than `site.stale_ns` ago. `dispensable` is 1 if the site
-            may drop the peer.
+        t_ns: Time, ns since the epoch (the common start of the session).
+        site: State of the site; updated in place. `regrouped` is set to the reason if a peer
+            was dropped or restored in this tick, otherwise to 0.
+        links: State of each link, one row per peer; updated in place. A peer is silent if its
+            last sample came into use more than `site.stale_ns` ago. `dispensable` is 1 if the
+            site may drop the peer.
     """
     site.regrouped = 0
     for j in range(links.shape[0]):
@@ -250,7 +246,8 @@ def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
             link.gone = 0.0
             site.regrouped = _RESTORED
 
-    # A change of the shares may give all of them to lost peers. Then no peer counts as lost.
+    # A change of the shares may give all of them to lost peers. In that case, no peer is
+    # treated as lost.
     if not _redistribute_shares(links):
         for j in range(links.shape[0]):
             link = links[j]

@@ -1,16 +1,16 @@
-"""Draws random numbers as functions of their arguments, without a state.
+"""Draws random numbers as stateless functions of their arguments.
 
-A usual generator updates a state, so its numbers depend on the order of the draws. This
+A conventional generator updates a state, so its output depends on the order of the draws. This
 counter-based generator encrypts a counter instead.
 
 Invariant (L4):
-    - A draw depends on the seed, the link (directed connection between two arms), the index of
-      the sample on the link and the purpose of the draw alone. It is therefore the same on
-      every machine, in simulated and in real time, and in any order in which samples arrive.
+    - A draw depends only on the seed, the link, the index of the sample on the link and the
+      purpose of the draw. It is therefore the same on every machine, in simulated and in real
+      time, and for any order in which samples arrive.
 
 The generator is Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random
-Numbers: As Easy as 1, 2, 3", SC 2011. NumPy has Philox too, but the compiled functions of the
-core need it for each sample. The tests compare it with published results.
+Numbers: As Easy as 1, 2, 3", SC 2011. NumPy also provides Philox, but the core draws numbers
+for each sample in compiled functions. Tests compare this implementation with published results.
 """
 
 import hashlib
@@ -42,14 +42,14 @@ def link_key(seed: int, link: str) -> int:
     """Returns the key from which all random numbers of a network link are computed.
 
     It depends on the seed of the run and the name of the link. Two links therefore have
-    independent delays, and the same seed repeats them.
+    independent delays, and running with the same seed reproduces them.
 
     Args:
         seed: Seed of the experiment.
         link: Name of the link, for example "m1->s".
 
     Returns:
-        An unsigned number of 64 bits.
+        An unsigned 64-bit integer.
     """
     digest = hashlib.sha256(f"{seed}/{link}".encode()).digest()
     return int.from_bytes(digest[:8], "little")
@@ -59,10 +59,10 @@ def link_key(seed: int, link: str) -> int:
 def philox(
     c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
 ) -> PhiloxWords:
-    """Returns four random 32-bit words for a counter and a key, by the Philox generator.
+    """Returns four random 32-bit words for a counter and a key, using the Philox generator.
 
     The same arguments always give the same words, so the generator needs no state. All words
-    are 32-bit numbers in uint64, so that products keep their upper halves.
+    are 32-bit values stored in uint64, so that products keep their upper halves.
 
     Args:
         c0: Lowest word of the 128-bit counter.
@@ -88,15 +88,15 @@ def philox(
 
 @leaf
 def unit_interval(high: np.uint64, low: np.uint64) -> float:
-    """Returns a number in the open interval (0, 1) that is made from two random 32-bit words.
+    """Converts two random 32-bit words to a number in the open interval (0, 1).
 
         (52 random bits + 1/2) / 2^52
 
-    The result is exact. With 53 bits the largest number would round to 1.
+    The result is exact. With 53 bits, the largest value would round to 1.
 
     Args:
-        high: Word that gives the upper bits.
-        low: Word that gives the lower bits.
+        high: Word that provides the upper bits.
+        low: Word that provides the lower bits.
     """
     upper_bits = float(high >> _TO_26) * _TWO_26
     lower_bits = float(low >> _TO_26)
@@ -105,16 +105,16 @@ def unit_interval(high: np.uint64, low: np.uint64) -> float:
 
 @leaf
 def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
-    """Returns two random numbers with the uniform distribution on the open interval (0, 1).
+    """Returns two random numbers, uniformly distributed on the open interval (0, 1).
 
-    They are a function of the arguments, so that a run can be repeated. Draws with different
+    They are a function of the arguments, so a run can be repeated. Draws with different
     arguments are independent.
 
     Args:
-        key: Key of the link for whose samples the numbers are drawn.
-        sample: Index of the sample.
-        purpose: Purpose of the numbers, which distinguishes several draws for one sample.
-        attempt: Attempt of a method that rejects draws, from 0.
+        key: Key of the link.
+        sample: Index of the sample for which the numbers are drawn.
+        purpose: Distinguishes several draws for the same sample.
+        attempt: Attempt of a method that rejects draws, starting at 0.
     """
     index = np.uint64(sample)
     a, b, c, d = philox(
@@ -130,15 +130,15 @@ def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[flo
 
 @leaf
 def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> float:
-    """Returns a random number with the normal distribution of mean 0 and deviation 1.
+    """Returns a normally distributed random number with mean 0 and standard deviation 1.
 
-    The method is due to Box and Muller. The same arguments always give the same number.
+    Uses the Box-Muller method. The same arguments always give the same number.
 
     Args:
-        key: Key of the link for whose samples the number is drawn.
-        sample: Index of the sample.
-        purpose: Purpose of the number, which distinguishes several draws for one sample.
-        attempt: Attempt of a method that rejects draws, from 0.
+        key: Key of the link.
+        sample: Index of the sample for which the number is drawn.
+        purpose: Distinguishes several draws for the same sample.
+        attempt: Attempt of a method that rejects draws, starting at 0.
     """
     u, v = uniforms(key, sample, purpose, attempt)
     radius = math.sqrt(-2.0 * math.log(u))
@@ -150,14 +150,15 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
 def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> float:
     """Draws a random number from a gamma distribution with scale 1.
 
-    The method, with its symbols, is the rejection of Marsaglia and Tsang, "A Simple Method for
-    Generating Gamma Variables", ACM TOMS 26 (2000). If the shape k is below 1, a number of
-    shape k + 1 is drawn and multiplied by u^(1 / k), where u is uniform from 0 to 1.
+    This is the rejection method of Marsaglia and Tsang, "A Simple Method for Generating Gamma
+    Variables", ACM TOMS 26 (2000), in the notation of that paper. If the shape k is below 1, a
+    number with shape k + 1 is drawn and multiplied by u^(1 / k), where u is uniform from 0 to
+    1.
 
     Args:
-        key: Seed of the network link for which the number is drawn.
-        sample: Index of the message on this link.
-        purpose: Distinguishes several draws for the same message. The draw uses the streams
+        key: Key of the link.
+        sample: Index of the sample for which the number is drawn.
+        purpose: Distinguishes several draws for the same sample. The draw uses the streams
             `purpose`, `purpose + 1` and `purpose + 2`.
         shape: Shape k of the distribution.
     """

@@ -1,15 +1,15 @@
-"""Compiles a user's control law, so that it runs at the speed of the simulation kernel.
+"""Compiles a user's control law with Numba so that it runs as fast as the simulation kernel.
 
-A control law is a class with a method `torque`, which computes the torque of an arm. This
-module compiles that method with Numba. The compiled method returns exactly the same numbers as
-the Python method, down to the last bit, so that a law can be developed in plain Python and
-compiled later.
+A control law is a class with a method `torque`, which computes the torque of an arm. The
+compiled method returns bit-identical results to the Python method, so a law can be developed in
+plain Python and compiled later.
 
 Invariant:
-    - The gains of a law are passed in a row of floats, so that new gains need no compilation.
-      Only another number of joints or peers, or other vectors, compile the law again.
-    - The kernel calls a law by its address, so that no law recompiles the kernel.
-    - An index out of range and a division by zero raise as they do in plain Python.
+    - The gains of a law are passed as a row of floats, so changing them does not require
+      recompilation. A law is recompiled only for a different number of joints or peers, or for
+      different vectors.
+    - The kernel calls a law by address, so a new law does not require recompiling the kernel.
+    - An index out of range and a division by zero raise the same exceptions as in plain Python.
 """
 
 import dis
@@ -45,12 +45,12 @@ from .user_law import (
 )
 
 CHECKED: Any = {"_nrt": False, "boundscheck": True}
-"""Options with which laws are compiled: wrong indices and divisions by zero raise."""
+"""Compiler options for laws: invalid indices and divisions by zero raise exceptions."""
 T = TypeVar("T")
 
 
 def compiled(law: T) -> T:
-    """Marks a control law, or a function that its `torque` calls, to be compiled (decorator).
+    """Decorator that marks a control law, or a function that `torque` calls, for compilation.
 
     >>> @tn.compiled
     ... class Damper:
@@ -60,8 +60,8 @@ def compiled(law: T) -> T:
     ...         for i in range(now.joints):
     ...             now.tau[i] = -now.qd[i]
 
-    A class with memory needs `remembers`. Code that Numba cannot compile is rejected when a
-    site is built.
+    A class that keeps state between ticks must declare it in `remembers`. Code that Numba
+    cannot compile is rejected when a site is built.
     """
     if not isinstance(law, type):
         # For a law in plain Python, the function stays a Python function, which accepts any
@@ -76,8 +76,8 @@ def compiled(law: T) -> T:
 def is_compiled(law: Any) -> bool:
     """Returns True if a user's control law is compiled to machine code before a run starts.
 
-    The class of such a law is marked with `compiled`. The result is False if Numba, the
-    compiler, is disabled.
+    The class of such a law is decorated with `compiled`. Returns False if Numba, the compiler,
+    is disabled.
     """
     config: Any = numba.config
     return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
@@ -85,7 +85,7 @@ def is_compiled(law: Any) -> bool:
 
 @leaf
 def _all_finite(values: Array) -> bool:
-    """Returns True if all numbers of an array are finite."""
+    """Returns True if all elements of an array are finite."""
     are_finite = True
     for i in range(values.shape[0]):
         are_finite = are_finite and np.isfinite(values[i])
@@ -97,10 +97,9 @@ def finish_law(s: Row, law: Array, sent: Array) -> None:
     """Checks the results of a user's control law, and limits its torque to the motors' range.
 
     Args:
-        s: State of the site (the process that runs the arm), with the torque and the estimate;
-            the torque is limited.
-        law: Memory and gains of the law. The memory, which the law keeps from tick to tick
-            (control period), comes first and is checked too.
+        s: State of the site, with the torque and the estimate; the torque is limited.
+        law: Memory of the law (the state that it keeps from tick to tick), followed by its
+            gains. The memory is checked too.
         sent: Vectors that the law sends to other arms.
 
     Raises:
@@ -129,20 +128,21 @@ def law_stage(
     channel: ChannelArrays,
     sent: Array,
 ) -> None:
-    """Computes the torque of an arm in one control period by a user's compiled law.
+    """Computes the torque of an arm in one tick with a user's compiled law.
 
-    The field `asked` of the arm's state is 1 while the law runs, so that an exception can be
+    The field `asked` of the site is 1 while the law runs, which allows an exception to be
     attributed to the law.
 
     Args:
-        k: Number of the tick (control period).
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        k: Number of the tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
         address: Address of the law's machine code.
-        law: Memory of the law, which it keeps from tick to tick, and its gains; changed.
-        site: State of the site (the process that runs the arm), in which the torque is written.
-        links: State of each link from another site, one row per link.
-        chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        channel: Vectors that the peers' laws sent.
+        law: Memory of the law (the state that it keeps from tick to tick) and its gains;
+            modified.
+        site: State of the site; the torque is written into it.
+        links: State of each incoming link, one row per link.
+        chain: Joint data, one row per joint. None for the planar two-link arm.
+        channel: Vectors sent by the laws of the peers.
         sent: Receives the vectors that this law sends.
 
     Raises:
@@ -157,18 +157,17 @@ def law_stage(
 
 
 class LawForm(NamedTuple):
-    """Data types for which a user's control law is compiled, such as its number of joints.
+    """Data types for which a user's control law is compiled, for example the number of joints.
 
-    Two laws of the same class with equal types share the compiled code. The other arms, with
-    which the law exchanges vectors, are called peers.
+    Two laws of the same class with equal types share the compiled code.
 
     Attributes:
-        law: Names and shapes of the law's numbers: its gains and its memory.
-        site: Data type of the state of the arm and its controller.
-        link: Data type of the state of a link from a peer.
+        law: Names and shapes of the law's gains and memory.
+        site: Data type of the state of the site.
+        link: Data type of the state of an incoming link.
         received: Vectors that a peer sends. None if there are no such vectors.
-        to_all: Vectors that go to all peers. None if there are no such vectors.
-        sent: Vectors that go to one peer alone. None if there are no such vectors.
+        to_all: Vectors sent to all peers. None if there are no such vectors.
+        sent: Vectors sent to a single peer. None if there are no such vectors.
         peers: Number of peers.
     """
 
@@ -182,13 +181,13 @@ class LawForm(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the NumPy data type that gives the numbers of an array the names of vectors.
+    """Returns a NumPy dtype whose fields are named vectors, or None if there are no vectors.
 
-    A compiled law thus reads vectors that other laws sent as fields, such as `received.F`. The
-    result is None if there are no vectors.
+    A compiled law uses it to access the vectors sent by other laws as fields, such as
+    `received.F`.
 
     Args:
-        vectors: The vectors, one after another in the row.
+        vectors: The vectors, in the order in which the row contains them.
         width: Number of floats in the row, if it is longer than the vectors.
     """
     if not vectors:
@@ -211,17 +210,16 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 # Numba cannot return a record from a function, so this function is inlined into its callers.
 @numba.njit(inline="always", **CHECKED)  # type: ignore[untyped-decorator]
 def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any) -> LawInput:
-    """Collects the data that a compiled control law may read and write in one control period.
+    """Collects the data that a compiled control law may read and write in one tick.
 
-    The vectors are views of the arrays of the simulation, because copying would take time in
-    every period.
+    The vectors are views of the simulation's arrays, which avoids copying in every tick.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         links: State of each link, one row per peer.
-        received: Vectors that came from each peer.
-        sent: Vectors that go to each peer alone.
-        to_all: Vectors that go to all peers.
+        received: Vectors received from each peer.
+        sent: Vectors sent to individual peers.
+        to_all: Vectors sent to all peers.
     """
     return LawInput(
         k=s.k,
@@ -251,11 +249,11 @@ def collect_law_input(s: Row, links: Any, received: Any, sent: Any, to_all: Any)
 
 @cache
 def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
-    """Compiles the method `torque` of a control law to machine code that the simulation calls.
+    """Compiles the method `torque` of a control law to machine code.
 
-    The arguments of the compiled function are arrays: the numbers of the law, the state of the
-    site and of its links, and the vectors that the law receives and sends. Machine code of laws
-    of this package is stored on disk. Laws of users are compiled in each process.
+    The arguments of the compiled function are arrays: the gains and memory of the law, the
+    state of the site and of its links, and the vectors that the law receives and sends. Machine
+    code for the laws of this package is cached on disk. User laws are compiled in each process.
 
     Args:
         torque: The method of the law's class.
@@ -277,17 +275,17 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
     def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
         """Collects the input of the control law, and calls the law's method `torque`.
 
-        Nothing is copied: the law reads and writes the arrays of its site, the process that
-        runs one arm. The numbers and vectors come as arrays of floats. A view of a part of such
-        an array gives the law the same memory as a record, whose fields have the names of the
-        numbers or vectors.
+        Nothing is copied: the law reads and writes the arrays of its site. The data are passed
+        as arrays of floats, and views of these arrays give the law access to the same memory as
+        a record with named fields.
 
         Args:
-            law: Numbers of the law: its gains and what it remembers.
+            law: Gains and memory of the law.
             site: State of the site, shape (1,).
-            links: State of each link, one row per peer (other site), in scenario order.
-            received: Vectors that came from each peer, one row per peer.
-            sent: Vectors that this law sends: those for all peers, then those for each peer.
+            links: State of each link, one row per peer, in scenario order.
+            received: Vectors received from each peer, one row per peer.
+            sent: Vectors that this law sends: first those for all peers, then those for each
+                peer.
         """
         s = site[0]
         # A layout is None if the vectors do not exist. Numba knows the layouts when it
@@ -319,24 +317,24 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
 
 
 def _read_numbers(law: Any, remembered: Sequence[str]) -> dict[str, np.ndarray[Any, Any]]:
-    """Collects the gains and the memory of a law, which its compiled form keeps in an array.
+    """Collects the gains and the memory of a law, which its compiled form stores in an array.
 
-    These are the attributes of the instance, and the attributes of its class whose names occur
-    in the method `torque`. Each of them needs a fixed type:
+    These are the attributes of the instance, and those attributes of its class whose names
+    occur in the method `torque`. Each of them needs a fixed type:
 
-    - Integers that do not change, such as counts and indices, remain integers. Booleans that
-      do not change become integers.
-    - All other numbers become floats. They include integers that may change: numbers that the
-      law remembers from tick to tick, attributes that `torque` assigns, and elements of lists.
-      A tick is a period of the control loop.
+    - Integers that do not change, such as counts and indices, remain integers. Booleans that do
+      not change become integers.
+    - All other numbers become floats. They include integers that may change: the memory of the
+      law, attributes assigned by `torque`, and elements of lists.
 
     Args:
         law: An instance of the law's class.
         remembered: Names of the attributes that the law keeps from tick to tick.
 
     Returns:
-        Arrays by attribute name: first the numbers that the law remembers, in their order, then
-        the other numbers in alphabetical order. Attributes that are not numbers are left out.
+        A mapping from attribute name to array: first the memory, in the order of `remembered`,
+            then the other attributes in alphabetical order. Attributes that are not numeric are
+            omitted.
     """
     # The byte code of `torque` names the attributes that it reads and assigns. It does not tell
     # whether they belong to the law, so names of attributes of other objects are included.
@@ -369,17 +367,17 @@ _INPUTS = {
     "LawInput": ("now", LawInput._fields),
     "Record(alpha": ("an entry of now.peers", PeerView._fields),
 }
-"""Names and fields of the inputs of a law, by the first words of their types in Numba."""
+"""Names and fields of the inputs of a law, keyed by the first words of their Numba types."""
 
 
 def _explain(error: Exception, law: Any) -> str:
     """Explains to a user in one sentence why Numba cannot compile a control law.
 
-    The messages of Numba are long and name types of Numba. Frequent causes are recognised and
-    explained in the terms of a law; otherwise the first sentence of the message is returned.
+    Numba's messages are long and refer to Numba types. Frequent causes are recognised and
+    explained in terms of the law; otherwise the first sentence of the message is returned.
 
     Args:
-        error: The error of Numba.
+        error: The error raised by Numba.
         law: An instance of the law's class.
     """
     text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
@@ -387,7 +385,7 @@ def _explain(error: Exception, law: Any) -> str:
     line_numbers = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
     location = f" (line {line_numbers[-1]})" if line_numbers else ""
 
-    # Numba's words for code that allocates memory.
+    # Numba's message for code that allocates memory.
     if "NRT required" in text or "returning of array" in text:
         return (
             f"the law creates an array or a list{location}: compute number by number, as in "
@@ -423,8 +421,8 @@ def _reads_own_attribute(law: Any, name: str) -> bool:
     """Returns True if the method `torque` of a law reads an attribute of the law itself.
 
     Numba's error names an unknown attribute, but not its object. The explanation for the user
-    depends on whether it is `self.NAME` or an attribute of the law's input. The byte code of
-    the method shows this.
+    depends on whether the attribute belongs to `self` or to the law's input, which can be seen
+    in the bytecode of the method.
 
     Args:
         law: An instance of the law's class.
@@ -440,14 +438,14 @@ def _reads_own_attribute(law: Any, name: str) -> bool:
 
 
 def _explain_field(name: str, kind: str, location: str) -> str:
-    """Explains to a user that the input of a control law has no field with a certain name.
+    """Explains to a user that the input of a control law has no field of a given name.
 
     The sentence suggests the field that was probably meant.
 
     Args:
         name: Name of the field.
         kind: The input, a key of `_INPUTS`.
-        location: Line of the law, as in " (line 12)"; empty if unknown.
+        location: Line in the law's source, for example " (line 12)"; empty if unknown.
     """
     subject, names = _INPUTS[kind]
     nearest = suggest_nearest(name, names) or f"; it has {', '.join(names)}"
@@ -457,13 +455,13 @@ def _explain_field(name: str, kind: str, location: str) -> str:
 def _explain_attribute(name: str, law: Any, location: str) -> str:
     """Explains to a user why a compiled control law cannot use an attribute of `self`.
 
-    Only numbers and lists of numbers can be compiled. The attribute is of another type, does
-    not exist, or is a method. For a method, the sentence says what to write instead.
+    Only numbers and lists of numbers can be compiled. The attribute has another type, does not
+    exist, or is a method. For a method, the sentence suggests what to write instead.
 
     Args:
         name: Name of the attribute.
         law: An instance of the law's class.
-        location: Line of the law, as in " (line 12)"; empty if unknown.
+        location: Line in the law's source, for example " (line 12)"; empty if unknown.
     """
     if not hasattr(law, name):
         problem = "does not exist"
@@ -484,17 +482,18 @@ def _explain_attribute(name: str, law: Any, location: str) -> str:
 class CompiledLaw:
     """A user's control law as machine code, with the arrays of the arm that it controls.
 
-    `plug_law` creates the object, and `compute` is called once per period of the control loop.
+    Created by `plug_law`. `compute` is called once per tick.
 
     Args:
         law: An instance of the law's class.
         setup: Setup of the site.
         arrays: Arrays of the site. Their vectors may be longer than this site needs.
-        sent: Part of the site's record for the vectors that the law sends, see `LawChannel`.
+        sent: Part of the site's record for the vectors that the law sends. See `LawChannel`.
 
     Attributes:
-        row: Memory of the law, which it keeps from tick to tick, followed by its gains.
-        address: Address of its machine code.
+        row: Memory of the law (the state that it keeps from tick to tick), followed by its
+            gains.
+        address: Address of the law's machine code.
         form: Layouts of the arrays of the law.
         torque: Method of the law's class that computes the torque, not compiled.
 
@@ -548,15 +547,13 @@ class CompiledLaw:
         arrays.site["remembered"] = self._remembered
 
     def bind(self) -> None:
-        """Compiles the stage that calls the law, for the types of this site's arrays.
+        """Compiles `law_stage`, which calls the law, for the types of this site's arrays.
 
-        The stage is `law_stage`, which `compute` calls in each tick, a period of the control
-        loop. The compilation takes seconds. Without this call, the first tick would wait for
-        it.
+        The compilation takes seconds. Without this call, it would take place in the first tick.
         """
         arrays = self._arrays
         assert arrays.channel is not None
-        # Only the types of the arguments count: any integers serve as tick and time.
+        # Only the types of the arguments matter, so tick and time may be any integers.
         example_tick = 0
         example_t_ns = 0
         self._stage = bind_leaf(
@@ -573,17 +570,16 @@ class CompiledLaw:
         )
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque of one control period by a call of the compiled law.
+        """Computes the torque of one tick with the compiled law.
 
-        The torque and the vectors that the law sends to other sites are written into the arrays
-        of this site (the process that runs the arm).
+        The torque and the vectors sent to other sites are written into the arrays of this site.
 
         Args:
-            k: Number of the control period.
-            t_ns: Nominal time of the period, ns since the start of the session.
+            k: Number of the tick.
+            t_ns: Nominal time of the tick, ns since the start of the session.
 
         Returns:
-            The numbers that the law remembers for the next period.
+            The law's memory after the tick.
 
         Raises:
             LawFailed: The law raised an exception, or returned an invalid result.
@@ -610,39 +606,36 @@ class CompiledLaw:
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the control law keeps from this control period to the next.
+        """State vector that the control law keeps from this tick to the next.
 
-        They are stored in the log, so that `restore` can continue a run from this period.
+        The vector is stored in the log, which allows `restore` to continue a run from this
+        tick.
         """
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
 
     @property
     def memory_names(self) -> tuple[str, ...]:
-        """A name for each number of `memory`, as "error[1]"."""
+        """Name of each entry of `memory`, for example "error[1]"."""
         return self._law.memory_names
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the control law to its state after a recorded control period.
+        """Restores the control law to its state after a recorded tick.
 
         Args:
-            memory: Numbers that `memory` returned after the tick.
+            memory: State vector returned by `memory` after that tick.
         """
         self.row[: self._remembered] = memory
 
     def find_failure(self, error: Exception) -> LawFailed | None:
-        """Describes how a user's control law failed, if an exception was raised by the law.
-
-        The result is None if the exception comes from the program itself, whose bugs must not
-        be blamed on the user.
+        """Describes how a user's control law failed, if the law raised the exception.
 
         Args:
-            error: An exception that was raised while the torque of a control period was
-                computed.
+            error: Exception raised while the torque of a tick was computed.
 
         Returns:
-            An exception that names the law and the reason. None if the error has another
-            origin.
+            An exception that names the law and the reason. None if the error originates in the
+            program itself, since its bugs must not be attributed to the user.
         """
         s: Row = self._arrays.site[0]
         was_law_running = bool(s.asked)
@@ -667,16 +660,16 @@ class CompiledLaw:
 def plug_law(
     law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array
 ) -> PlainLaw | CompiledLaw:
-    """Connects a user's control law to a site, so that the law can compute torques.
+    """Connects a user's control law to a site, which can then compute torques with it.
 
-    A site is the process that runs one arm. The law is compiled if its class is marked for
-    compilation; otherwise it runs as plain Python.
+    The law is compiled if its class is marked for compilation. Otherwise it runs as plain
+    Python.
 
     Args:
         law: An instance of the law's class.
         setup: Setup of the site.
         arrays: Arrays of the site, which the law reads and writes.
-        sent: Array for the values that the law sends to other sites, see `LawChannel`.
+        sent: Array for the values that the law sends to other sites. See `LawChannel`.
 
     Returns:
         The law, ready for use.

@@ -1,17 +1,15 @@
-"""Defines where the values that a control law sends to other arms are stored in a record.
+"""Layout of the values that a control law sends to other arms, as stored in a record.
 
-Each arm sends its motion to the other arms, its peers. Some control laws send further vectors,
-for example wave variables or energies. A vector either goes to all peers, or each peer gets a
-vector of its own.
+Each arm sends its motion to its peers. Some control laws send additional vectors, for example
+wave variables or energies. A vector is either sent to all peers, or is different for each peer.
 
-In each control period, the site (the process that controls an arm) stores all these values in
-the field `ch` of its record. A peer receives the part that is meant for it. Therefore the
-records of the sender show what each peer received.
+In each tick, the site stores all these values in the field `ch` of its record, and each peer
+receives the part addressed to it. The records of the sender therefore show what each peer was
+sent.
 
 Invariant:
-    - The field contains first the vectors for all peers. The vectors for a single peer follow,
-      peer by peer in the order in which the scenario, the description of the experiment, lists
-      the sites.
+    - The field contains the vectors for all peers first, followed by the vectors for individual
+      peers, ordered by peer as in the scenario.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,19 +20,22 @@ from ...errors import count_nouns
 MAX_SENT = 16
 """Largest number of values per joint that a law sends to a peer."""
 MAX_RECORD_SENT = 1024
-"""Largest number of values that a law sends to all its peers together, as in each record."""
+"""Largest number of values that a law sends to all its peers in one tick, as stored in a
+record.
+"""
 
 
 class SentVector(NamedTuple):
-    """Vector that a control law sends to other arms in every control period, such as energies.
+    """A vector that a control law sends to other arms in every tick, for example energies.
 
-    It travels in the same network message as the motion of the arm.
+    The vector is part of the network message that carries the motion of the arm.
 
     Attributes:
-        name: Name of the vector, as the law uses it.
-        unit: Unit of its values.
-        length: Number of its values.
-        per_peer: True if each peer gets its own vector, False if all peers get the same vector.
+        name: Name of the vector, as used by the law.
+        unit: Unit of its entries.
+        length: Number of its entries.
+        per_peer: True if each peer gets a different vector, False if all peers get the same
+            vector.
     """
 
     name: str
@@ -48,8 +49,8 @@ class _SentEntry(NamedTuple):
 
     Attributes:
         vector: Vector that contains the value.
-        peer: The only peer that gets the vector, or "" if all peers get it.
-        position: Position of the value in the vector, from 0.
+        peer: The only receiver of the vector, or "" if it is sent to all peers.
+        position: Index of the value in the vector.
     """
 
     vector: SentVector
@@ -58,10 +59,10 @@ class _SentEntry(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Label of the vector to which the number belongs, for example "E" or "u[m2]".
+        """Label of the value, for example "E" or "u[m2]".
 
-        The label is the name of the vector. If only one peer (another arm's process) receives
-        the vector, the name of this peer follows in brackets.
+        The label is the name of the vector that contains the value. If the vector is sent to a
+        single peer, the name of this peer follows in brackets.
         """
         return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
 
@@ -72,12 +73,11 @@ class _SentEntry(NamedTuple):
 class LawChannel(NamedTuple):
     """All vectors that the control law of one arm sends to the laws of other arms.
 
-    Some laws send, besides the motion of the arm, vectors such as waves or energies. The
-    vectors are listed in the order in which the log stores them.
+    These are sent in addition to the motion of the arm, for example waves or energies.
 
     Attributes:
-        vectors: The vectors. Those that are the same for all peers (the other arms) come before
-            those that are different for each peer.
+        vectors: The vectors in the order in which the log stores them: those that are the same
+            for all peers, then those that are different for each peer.
         peers: Number of peers.
     """
 
@@ -85,43 +85,38 @@ class LawChannel(NamedTuple):
     peers: int = 0
 
     def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
-        """Returns the vectors that are equal for all receivers, or different for each one.
-
-        The receivers are the other arms, called peers. A wave, for example, is different for
-        each receiver.
+        """Returns the vectors that are the same for all peers, or those that differ.
 
         Args:
-            per_peer: True for vectors that are different for each peer, False for vectors that
-                are the same for all peers.
+            per_peer: True for the vectors that are different for each peer, False for the
+                vectors that are the same for all peers.
         """
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Counts the values of the vectors that go to all peers, or to each peer alone.
-
-        A peer is another arm's process, which receives the vectors that the law sends.
+        """Counts the values of the vectors that go to all peers, or to each single peer.
 
         Args:
-            per_peer: True for vectors that are different for each peer; the result is then the
-                count for a single peer. False for vectors that are the same for all peers.
+            per_peer: True to count the values that differ between peers, for a single peer.
+                False to count the values that are the same for all peers.
         """
         return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
 
     @property
     def received_size(self) -> int:
-        """Number of values that one other arm receives from the law with each message.
+        """Number of values that one peer receives from the law with each message.
 
-        They are the vectors that are the same for all receivers, and this receiver's own copy
-        of each vector that is different for each receiver.
+        They comprise the vectors that are the same for all peers, and this peer's copy of each
+        vector that differs between peers.
         """
         return sum(vector.length for vector in self.vectors)
 
     @property
     def record_size(self) -> int:
-        """Number of floats that the law sends to all receivers in a control period.
+        """Number of floats that the law sends to all peers in one tick.
 
-        This is the length of the field `ch` in the log. A vector that is different for each
-        receiver counts once per receiver.
+        This is the length of the field `ch` in the log. A vector that differs between peers
+        counts once per peer.
         """
         if not self.vectors:
             return 0
@@ -130,16 +125,16 @@ class LawChannel(NamedTuple):
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Locates the values that a receiving control law reads, in a message of this law.
+        """Locates the values that a receiving control law reads in a message of this law.
 
-        The receiver may read fewer vectors, and in another order.
+        The receiver may read fewer vectors, and in a different order.
 
         Args:
             vectors: The vectors that the other law reads.
 
         Returns:
             For each value of these vectors, its index among the values that this law sends to a
-            peer. The index is -1 for the values of a vector that this law does not send.
+            peer, or -1 if this law does not send the vector.
         """
         first_column = 0
         first_columns = {}
@@ -157,12 +152,12 @@ class LawChannel(NamedTuple):
         return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[_SentEntry]:
-        """Describes each value that the law sends in a control period, one after another.
+        """Yields a description of each value that the law sends in one tick.
 
         The order is that of the field `ch` in the log.
 
         Args:
-            peers: Names of the sites that run the other arms, in the order of the scenario.
+            peers: Names of the peers, in scenario order.
 
         Yields:
             The vector that contains the value, the receiver, and the position of the value in
@@ -177,9 +172,9 @@ class LawChannel(NamedTuple):
                     yield _SentEntry(vector, peer, n)
 
     def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
-        """Returns the values sent by a control law that one receiver (peer) gets.
+        """Returns the values sent by a control law that one peer receives.
 
-        They are the values for all receivers, and the values for this receiver alone.
+        These are the values for all peers, and the values for this peer alone.
 
         Args:
             sent: All values that the law sent in a tick, as in its record.
@@ -196,7 +191,7 @@ class LawChannel(NamedTuple):
     def join_received(channels: "Sequence[LawChannel]") -> tuple[SentVector, ...]:
         """Returns all vectors that the control law of an arm may receive from the other laws.
 
-        A vector that several laws send, such as the energy E, appears once.
+        A vector sent by several laws, such as the energy E, appears once.
 
         Args:
             channels: Vectors that each of the other laws sends.

@@ -1,12 +1,12 @@
-"""Gives a control law its input in each period: the motion of its arm and of the other arms.
+"""Provides the input of a control law in each tick: the motion of its own and the other arms.
 
-The compiled code of a control period stores the state of an arm in rows of arrays. A compiled
-control law reads these rows directly. For a law in plain Python, this module copies the rows to
-lists and writes the results of the law back.
+The compiled control loop stores the state of an arm in rows of arrays, which a compiled control
+law reads directly. For a law in plain Python, this module copies the rows to lists and writes
+the results of the law back.
 
 Invariant:
-    - A law receives the same numbers whether it is compiled or runs in plain Python.
-    - A vector that the law sends to other arms keeps its numbers until the law writes it again.
+    - A law receives the same values whether it is compiled or runs in plain Python.
+    - A vector that the law sends to other arms keeps its values until the law overwrites it.
 """
 
 from collections.abc import Sequence
@@ -36,12 +36,12 @@ from .user_law import (
 def _update_model(s: Row, chain: RowArray | None) -> None:
     """Computes the gravity torque, inertia matrix and bias torque of an arm for a user's law.
 
-    The bias torque is the torque of Coriolis forces, gravity and friction, which an arm needs
-    even without acceleration.
+    The bias torque is the torque due to Coriolis forces, gravity and friction, which is
+    required even without acceleration.
 
     Args:
-        s: State of the site (the process that runs the arm).
-        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        s: State of the site.
+        chain: Joint data, one row per joint. None for the planar two-link arm.
     """
     if chain is None:
         two_link_stages.update_model(s)
@@ -55,15 +55,15 @@ def update_law_view(
 ) -> None:
     """Prepares the input of a user's control law: time, arm model and ages of the samples.
 
-    A sample is the state that another arm sends. All other parts of the input exist already.
-    The torque is set to NaN, so that a law that does not write its torque is noticed.
+    The rest of the input is already in place. The torque is set to NaN, so that a law that does
+    not write its torque is detected.
 
     Args:
-        k: Number of the control period.
-        t_ns: Nominal time of the period, ns since the start of the session.
-        site: State of the site (the process that runs the arm), shape (1,); written.
-        links: States of the links from the other sites, one row per link; written.
-        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        k: Number of the tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        site: State of the site, shape (1,); modified.
+        links: States of the links from the other sites, one row per link; modified.
+        chain: Joint data, one row per joint. None for the planar two-link arm.
     """
     s: Row = site[0]
     s.k = k
@@ -84,19 +84,19 @@ def update_law_view(
 _PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "bias")
 _PER_COORDINATE = ("q_des", "qd_des", "felt")
 _IN_ROW = {"gravity": "G"}
-"""Fields of the site's row whose names differ from those of a law's input."""
+"""Mapping from field names of a law's input to those of the site's row, where they differ."""
 _FIRST_PEER_VECTOR = PeerView._fields.index("q")
-"""Index of the first vector in `PeerView`: q, qd and tau_x come last, after single numbers."""
+"""Index of the first vector in `PeerView`: q, qd and tau_x follow the scalar fields."""
 
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
-    """Divides a list of numbers into named vectors, which a control law reads as attributes.
+    """Splits a list of numbers into named vectors, which a control law reads as attributes.
 
-    For example, a law that receives the vector F reads it as `received.F`.
+    For example, a received vector F is read as `received.F`.
 
     Args:
         vectors: Names and lengths of the vectors.
-        numbers: Values of the vectors, one vector after another. Further values are ignored.
+        numbers: Concatenated values of the vectors. Any further values are ignored.
     """
     named = SimpleNamespace()
     first = 0
@@ -110,14 +110,14 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 class PlainLaw:
     """A user's control law in plain Python, with the arrays of the arm that it controls.
 
-    In each control period, the law receives lists of numbers, and its results are written into
-    the arrays.
+    In each tick, the law receives lists of numbers, and its results are written into the
+    arrays.
 
     Args:
         law: The law.
         setup: Setup of the site.
         arrays: Arrays of the site. Their vectors may be longer than this site needs.
-        sent: Part of the site's record for the vectors that the law sends, see `LawChannel`.
+        sent: Part of the site's record for the vectors that the law sends. See `LawChannel`.
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
@@ -131,7 +131,7 @@ class PlainLaw:
         self._sent = sent
         self._update = update_law_view
 
-        # Views of the arrays: reading them gives the present state of the site, and writing
+        # Views of the arrays: reading them yields the current state of the site, and writing
         # into them changes it.
         site = arrays.site[0]
         self._views: dict[str, Array] = {}
@@ -160,23 +160,23 @@ class PlainLaw:
     def bind(self) -> None:
         """Compiles the function that collects the input of the control law.
 
-        Without this call, the first period of the control loop would wait for the compilation.
+        Without this call, the compilation would take place in the first tick.
         """
         a = self._arrays
         self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque of one control period by a call of the user's law.
+        """Computes the torque of one tick with the user's law.
 
         The torque, the parameter estimate and the vectors for other sites are written into the
-        arrays of this site (the process that runs the arm).
+        arrays of this site.
 
         Args:
-            k: Number of the control period.
-            t_ns: Nominal time of the period, ns since the start of the session.
+            k: Number of the tick.
+            t_ns: Nominal time of the tick, ns since the start of the session.
 
         Returns:
-            The numbers that the law remembers for the next period.
+            The law's memory after the tick.
 
         Raises:
             LawFailed: The law raised an exception, or returned an invalid result.
@@ -196,42 +196,39 @@ class PlainLaw:
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the law remembers for the next period of the control loop.
+        """State vector that the law keeps from this tick to the next.
 
-        They are stored with the results of each period. `restore` can continue the run from
-        them.
+        The vector is stored with the results of each tick, which allows `restore` to continue
+        the run.
         """
         return self._law.memory
 
     @property
     def memory_names(self) -> tuple[str, ...]:
-        """A name for each number of `memory`, as "error[1]"."""
+        """Name of each entry of `memory`, for example "error[1]"."""
         return self._law.memory_names
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the control law to its state after a recorded control period.
+        """Restores the control law to its state after a recorded tick.
 
         Args:
-            memory: Numbers that `memory` returned after the tick.
+            memory: State vector returned by `memory` after that tick.
         """
         self._law.restore(memory)
 
     def _read(self, k: int) -> LawInput:
-        """Collects the input of the control law for one tick, a period of the control loop.
+        """Collects the input of the control law for one tick.
 
-        `update_law_view` must have written the arrays before. All numbers are copied from them
-        to lists, which plain Python reads faster than arrays.
+        `update_law_view` must have been called before. All values are copied from the arrays to
+        lists, which plain Python reads faster.
 
-        The input also contains the vectors that the law sends to the laws of its peers (other
-        arms), with the numbers of the previous tick. The law overwrites them, and
-        `_collect_sent` reads the new numbers. The array has the order of a record: first the
-        vectors that go to all peers, then for each peer the vectors that go to this peer alone.
+        The input also contains the vectors that the law sends to its peers, with their values
+        from the previous tick. The law overwrites them, and `_collect_sent` reads the new
+        values. The array is ordered like a record: first the vectors sent to all peers, then
+        the vectors sent to each single peer.
 
         Args:
-            k: Number of the tick (control period).
-
-        Returns:
-            The input.
+            k: Number of the tick.
         """
         setup = self._setup
         # One column per field of `PeerView`, in their order, with one entry per peer.
@@ -267,13 +264,13 @@ class PlainLaw:
         )
 
     def _collect_sent(self, now: LawInput) -> list[float]:
-        """Returns all numbers that the law sends to other arms, in the order of the log.
+        """Returns all values that the law sends to other arms, in log order.
 
         Args:
-            now: Input of the tick, which contains the vectors that the law wrote.
+            now: Input of the tick, which contains the vectors written by the law.
 
         Raises:
-            ValueError: A vector has another length than the law declares.
+            ValueError: The length of a vector differs from its declaration.
         """
         sent = _collect_vectors(self._sends_to_all, now.to_all, "to_all")
         for j, to_peer in enumerate(now.sent):
@@ -282,17 +279,17 @@ class PlainLaw:
 
 
 def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) -> list[float]:
-    """Returns the numbers of the vectors that a control law sends, as one flat list.
+    """Returns the vectors that a control law sends as one flat list.
 
-    The order and the lengths are those that the law has declared.
+    The order and the lengths follow the law's declaration.
 
     Args:
         declared: Vectors that the law declares.
         vectors: Values of the vectors, as attributes.
-        name: Name of `vectors` in the law's input, for errors.
+        name: Name of `vectors` in the law's input, for error messages.
 
     Raises:
-        ValueError: A vector has another length than the law declares.
+        ValueError: The length of a vector differs from its declaration.
     """
     numbers: list[float] = []
     for vector in declared:

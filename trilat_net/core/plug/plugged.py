@@ -1,16 +1,16 @@
 """Compiles models that users write in Python, so that the simulation can call them.
 
 A model describes an operator who moves an arm, an environment that the arm touches, or the
-delays of a network. It consists of numbers, its parameters, and of a function. The simulation
-calls the function with the parameters and with a row of an array. The function reads its input
-from the row and writes its result into it.
+delays of a network. It consists of numerical parameters and a function. The simulation calls
+the function with the parameters and a row of an array. The function reads its input from the
+row and writes its result into it.
 
 Invariant:
-    - A function is compiled again only if the shapes of its parameters or the fields of the row
-      change. The values of the parameters are stored in a table, so new values need no
+    - A function is recompiled only if the shapes of its parameters or the fields of the row
+      change. The parameter values are stored in a table, so changing them requires no
       compilation.
-    - The simulation itself is never compiled again for a new function, because it calls the
-      function by its address.
+    - The simulation itself is never recompiled for a new function, because it calls the
+      function by address.
 """
 
 import hashlib
@@ -30,14 +30,14 @@ from ..step.vectors import Array
 _OPTIONS: Any = {"_nrt": False, "error_model": "numpy"}
 _config: Any = numba.config
 _PLAIN: dict[int, Callable[..., None]] = {}
-"""Python functions, by the numbers that replace their addresses if Numba is disabled."""
+"""Python functions, keyed by the numbers that replace their addresses if Numba is disabled."""
 
 
 @intrinsic
 def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
-    """Generates the call of a compiled function, which returns nothing, by its address.
+    """Generates the call of a compiled function by its address. The function returns nothing.
 
-    Numba calls this function when it compiles a caller of `call_address`. An exception of the
+    Numba calls this while compiling a caller of `call_address`. An exception raised by the
     called function propagates to its caller.
 
     Args:
@@ -46,17 +46,17 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
         arguments: Numba's type of the tuple of arguments.
 
     Returns:
-        The signature, as Numba expects it of an intrinsic, and the function that generates the
-        LLVM code of the call.
+        The signature and the function that generates the LLVM code of the call, as Numba
+        requires from an intrinsic.
     """
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Generates the LLVM code of the call `function(*arguments)` by the function's address.
 
-        The address is a value at run time. Therefore the compiled caller does not depend on the
-        function, and is not compiled again for another function. Numba calls `generate` while
-        it compiles the caller. Arguments, result and exceptions are passed as in all functions
-        that Numba compiles.
+        Because the address is a runtime value, the compiled caller does not depend on the
+        function and need not be recompiled for another function. Numba calls `generate` while
+        compiling the caller. Arguments, result and exceptions are passed as in any function
+        compiled by Numba.
 
         Args:
             context: Numba's description of the target processor.
@@ -67,7 +67,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
                 tuple of its arguments.
 
         Returns:
-            The LLVM value of None, which is the result of the call in Python.
+            The LLVM value of None, the result of the call in Python.
         """
         convention = context.call_conv
         address_value, tuple_value = values
@@ -91,11 +91,10 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
 
 
 def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
-    """Calls a Python function by its number in `_PLAIN`, when Numba is disabled.
+    """Calls a Python function by its number in `_PLAIN`. Used when Numba is disabled.
 
-    Without Numba there is no machine code and so no address. `UserModel` then registers
-    the Python function under a number and returns this number in place of the
-    address.
+    Without Numba, there is no machine code and hence no address. `UserModel` then registers the
+    Python function under a number and returns this number instead of an address.
 
     Args:
         address: The number.
@@ -106,21 +105,21 @@ def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
 
 
 call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
-"""Calls the function at an address with a tuple of arguments; its exceptions propagate."""
+"""Calls the function at an address with a tuple of arguments. Exceptions propagate."""
 
 
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
-    """Returns a hash of all source files in the folder of a function.
+    """Returns a hash of all source files in a function's folder.
 
-    Compiled code is stored on disk under this hash. After a change of a source file, the hash
-    is different, and the function is compiled again.
+    Compiled code is cached on disk under this hash. A change to any of the files changes the
+    hash, and the function is recompiled.
 
     Args:
         function: A function.
 
     Returns:
-        The hash. Empty if the function is not part of this package, because its code is not
-        stored then.
+        The hash, or an empty string if the function is not part of this package, in which case
+        its code is not cached.
     """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[2]):
@@ -131,10 +130,10 @@ def digest_sibling_sources(function: Callable[..., Any]) -> str:
 
 
 def find_address(compiled: Any) -> int:
-    """Returns the memory address of a compiled function, at which machine code can call it.
+    """Returns the memory address at which machine code can call a compiled function.
 
     Args:
-        compiled: Function that Numba compiled for one signature.
+        compiled: Function compiled by Numba for exactly one signature.
     """
     result = compiled.get_compile_result(compiled.nopython_signatures[0])
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
@@ -146,19 +145,18 @@ def _compile(
 ) -> Any:
     """Compiles a function of a user's model, so that machine code can call it.
 
-    The function takes the parameters of its model as a record. The simulation has the
-    parameters as an array of floats. Therefore the result takes this array, and gives the
-    function a view of it as a record.
+    The function expects the parameters of its model as a record, whereas the simulation stores
+    them as an array of floats. The result therefore takes this array, and passes the function a
+    view of it as a record.
 
     Args:
         function: The function of the model, called with the parameters and with a row.
-        form: Layout of the parameters: name and shape of each parameter. All are floats.
-        row: Layout of the row, from which the function reads its input and into which it
-            writes its result.
+        form: Layout of the parameters: the name and shape of each parameter, all floats.
+        row: Layout of the row that contains the input of the function and receives its result.
 
     Returns:
-        The compiled function, called with the array of the parameters and with the row. If
-        Numba is disabled, a Python function.
+        The compiled function, whose arguments are the parameter array and the row. A Python
+        function if Numba is disabled.
     """
     count = form.itemsize // 8  # floats of 8 bytes
     compute = numba.njit(**_OPTIONS)(function)
@@ -167,11 +165,11 @@ def _compile(
         """Calls the user's function with the parameters of its model as a record.
 
         The simulation stores the parameters of all models as floats in one table. The record is
-        a view of the model's part of this table, with the names of the parameters.
+        a view of this model's part of the table, with the parameter names as field names.
 
         Args:
             numbers: The parameters, possibly followed by other floats.
-            now: Row with the input of the function, into which it writes its result.
+            now: Row that contains the input of the function and receives its result.
         """
         model = numbers[:count].view(form)[0]
         compute(model, now)
@@ -184,7 +182,7 @@ def _compile(
     sources = digest_sibling_sources(function)
     is_part_of_this_package = bool(sources)
     if is_part_of_this_package:
-        # The machine code is stored on disk, under a hash of everything that it depends on.
+        # The machine code is cached on disk, under a hash of everything that it depends on.
         text = f"{sources} {function.__module__} {function.__qualname__} {form} {row}"
         digest = hashlib.sha256(text.encode()).hexdigest()
         return compile_named(call, f"own_{digest[:32]}", signature, **_OPTIONS)
@@ -193,7 +191,7 @@ def _compile(
 
 
 class UserModel:
-    """A user's model in the form that the compiled simulation needs: numbers and machine code.
+    """A user's model in the form required by the simulation: parameters and machine code.
 
     Args:
         model: A model of an operator, an environment or network delays.
@@ -204,20 +202,20 @@ class UserModel:
 
     @property
     def numbers(self) -> Array:
-        """All numerical parameters of the model, one after another.
+        """All numerical parameters of the model, concatenated into one array.
 
         The compiled simulation stores the parameters of all models in this form. The array is
         empty if the model has no parameters.
         """
         fields = [value.ravel() for value in self._find_parameters().values()]
-        # A model without numbers gives an empty array.
+        # A model without parameters yields an empty array.
         return np.concatenate([np.zeros(0), *fields])
 
     def compile_to_address(self, name: str, row: np.dtype[np.void]) -> int:
         """Compiles a function of the model, and returns the address of its machine code.
 
-        The compiled simulation then calls the function by this address, without Python. The
-        function is called with the parameters of the model and with a row of an array.
+        The compiled simulation uses the address to call the function without Python. The
+        arguments of the function are the parameters of the model and a row of an array.
 
         Args:
             name: Name of the function in the class of the model.
@@ -241,10 +239,10 @@ class UserModel:
         return find_address(call)
 
     def _find_parameters(self) -> dict[str, Array]:
-        """Returns the numerical fields of the model as arrays, by name.
+        """Returns the numerical fields of the model, a mapping from name to array.
 
         The compiled function of the model receives them as a row with these field names. Fields
-        of other types, such as texts, are left out. Example: a field `stiffness_n_m = 200`
+        of other types, such as strings, are omitted. For example, a field `stiffness_n_m = 200`
         becomes {"stiffness_n_m": array(200.0)}.
         """
         parameters = {}

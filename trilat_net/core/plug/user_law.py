@@ -1,14 +1,13 @@
-"""Calls a user's control law in plain Python, once per period of the control loop.
+"""Calls a user's control law in plain Python, once per tick.
 
 A control law is a class with a method `torque`, which computes the torque of an arm from a
-`LawInput`: the motion of the arm and of the other arms. From period to period a law may keep
-numbers, its memory, for example an integral of the error.
+`LawInput`: the motion of the arm and of the other arms. A law may keep state between ticks (its
+memory), for example the integral of an error.
 
 Invariant:
-    - A law is a function of its input and its memory: equal inputs and an equal memory give
-      equal torques.
-    - The record of each period contains the memory. A run can therefore be resumed from the
-      middle of its log.
+    - A law is a function of its input and its memory: equal inputs and equal memory give equal
+      torques.
+    - Each record contains the memory, so a run can be resumed from the middle of its log.
 """
 
 import math
@@ -25,20 +24,20 @@ from ..step.vectors import Vector
 
 
 class LawContext(NamedTuple):
-    """Facts about the arm and the other arms that a control law receives when it is created.
+    """Facts about the arms that a control law receives when it is created.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
     ...         self.d = [d] * facts.joints
 
     Attributes:
-        site: Name of the site, the process that runs one arm.
+        site: Name of the site.
         rate_hz: Tick rate of the site, Hz.
         g_m_s2: Gravitational acceleration, m/s^2.
         lengths_m: Lengths of the two links, m.
-        theta: The arm's true parameters, shape (5,), for a law that knows them; () if they are
-            unknown, as for a real arm that was not identified.
-        tau_limit_nm: Largest torque of a joint, N m; one number, or one per joint.
+        theta: The arm's true parameters, shape (5,), for laws that require them; () if they are
+            unknown, as for a real arm that has not been identified.
+        tau_limit_nm: Largest joint torque, N m; a single value, or one value per joint.
         joints: Number of joints of the arm.
         coordinates: Number of values in q, qd and tau_x of a peer: one per joint, or one per
             coordinate of the end effector.
@@ -59,7 +58,7 @@ class LawContext(NamedTuple):
 def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """Creates an arithmetic method of `LawVector`, such as `__add__`, from an operation.
 
-    The method works number by number. Its arguments are the vector and the other operand.
+    The method works elementwise. Its arguments are the vector and the other operand.
 
     Args:
         operate: The operation on two numbers, for example `operator.add`.
@@ -70,10 +69,10 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
 
         Args:
             vector: The first vector.
-            other: A vector with as many numbers, or a single number.
+            other: A vector of the same length, or a single number.
 
         Returns:
-            The resulting vector. NotImplemented if `other` is of another type.
+            The resulting vector, or NotImplemented if `other` is of another type.
         """
         if isinstance(other, Real):
             return LawVector([operate(number, other) for number in vector])
@@ -91,10 +90,10 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
 
 
 class LawVector(list[Any]):
-    """List of numbers with arithmetic, so that users can write control laws as formulas.
+    """A list of numbers with elementwise arithmetic, for writing control laws as formulas.
 
-    Operations act number by number, as in `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`. The
-    other operand is a number, or a list with as many numbers.
+    For example, `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`. The other operand is a number or a
+    list of the same length.
     """
 
     __add__ = __radd__ = __iadd__ = _make_operator(operator.add)
@@ -108,20 +107,21 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """Information that a control law has about another arm (a peer) in a control period.
+    """Data about a peer that a control law has in one tick.
 
-    It is the newest state (sample) from the other arm whose network delay has passed. Before
-    the first sample, it is the start pose of the other arm, at rest.
+    The data come from the newest sample whose network delay has passed. Before the first
+    sample, they describe the start pose of the peer, at rest.
 
     Attributes:
-        alpha: Dominance factor of the peer now, the weight with which this site follows it.
-        tick: Stamp of the sample in use, a tick of the peer; -1 before the first sample.
-        age_s: Age of that sample, s; before the first sample, the time since the start of the
-            session.
-        new: 1 if the sample came into use at this tick, else 0.
+        alpha: Current dominance factor of the peer, the weight that this site gives to it.
+        tick: Tick of the peer at which the sample in use was sent; -1 before the first sample.
+        age_s: Age of the sample in use, s; before the first sample, the time since the start of
+            the session.
+        new: 1 if the sample came into use in this tick, else 0.
         q: Joint angles or coordinates of the sample, rad or m.
         qd: Derivative of q, rad/s or m/s.
-        tau_x: Minus the torque of hand and environment ON the peer's arm, N m or N.
+        tau_x: External torque of the peer's arm, N m or N; the torque ON that arm is its
+            negative.
     """
 
     alpha: float
@@ -134,44 +134,47 @@ class PeerView(NamedTuple):
 
 
 class LawInput(NamedTuple):
-    """Input of a control law in one control period (tick), and fields for its results.
+    """Input of a control law in one tick, and fields for its results.
 
-    A vector has one number per joint, or one per coordinate that the arms share.
+    Vectors have one entry per joint, or one per shared coordinate.
 
     >>> def torque(self, now: tn.LawInput) -> list[float]:
     ...     return [-d * speed for d, speed in zip(self.d, now.qd)]
 
     In plain Python, each vector is a `LawVector`, which supports arithmetic. A compiled law
-    uses the numbers of a vector one by one.
+    must access the entries of a vector one by one.
 
     Attributes:
-        k: Number of the tick (control period).
+        k: Number of the tick.
         t_s: Nominal time since the start of the session, s.
-        h_s: The period, s.
+        h_s: The control period, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         q_des: Reference of Eq. (6), rad.
         qd_des: Derivative of q_des, rad/s.
-        felt: Torque of hands and environments ON the peers' arms as received, weighted by
-            dominance, N m: the sum of -alpha tau_x of the peers.
+        felt: External torque ON the peers' arms as received, weighted by dominance, N m: the
+            sum of -alpha tau_x over the peers.
         joints: Number of joints.
-        coordinates: Number of values in each vector of a peer.
-        tau: Torque of each joint, N m, written by the law and then limited.
+        coordinates: Length of the vectors q, qd and tau_x of a peer.
+        tau: Torque of each joint, N m, written by the law and limited afterwards.
         peers: The peers in scenario order.
-        received: Per peer, the vectors by name that its law sent with the sample in use. Zeros
-            before the first sample, and for a vector that the peer's law does not send.
-        sent: Per peer, the vectors that go to this peer alone, written by the law. A vector
+        received: For each peer, the vectors that its law sent with the sample in use, accessed
+            by name. Zeros before the first sample, and for a vector that the peer's law does
+            not send.
+        sent: For each peer, the vectors sent to this peer alone, written by the law. A vector
             that is not written keeps its values.
-        to_all: Vectors that go to all peers, also written by the law.
-        tau_x: Minus the torque of hand and environment ON this arm in this tick, N m, the sign
-            of Eq. (8).
-        tau_before: Torque of the previous tick, within its limits, N m; zeros at tick 0.
+        to_all: Vectors sent to all peers, also written by the law.
+        tau_x: External torque of this arm in this tick, N m, with the sign of Eq. (8); the
+            torque ON the arm is its negative.
+        tau_before: Torque of the previous tick after limiting, N m; zeros at tick 0.
         q_before: Joint angles of the previous tick, rad; the start pose at tick 0.
-        gravity: Torque that holds the arm, N m; zeros if its parameters are unknown.
-        theta_hat: Estimate in the record, written by the law; otherwise it does not change.
+        gravity: Torque that holds the arm against gravity, N m; zeros if the arm's parameters
+            are unknown.
+        theta_hat: Parameter estimate that is stored in the record. Unchanged unless the law
+            writes it.
         inertia: M(q), one row per joint, for a law with `needs_model`; otherwise zeros.
-        bias: C qd + G, N m, for a law with `needs_model`; otherwise zeros. For a chain, it
-            includes the friction, minus the torque of the joint stops.
+        bias: C qd + G, N m, for a law with `needs_model`; otherwise zeros. For a chain,
+            friction is added and the torque of the joint stops subtracted.
     """
 
     k: int
@@ -199,33 +202,34 @@ class LawInput(NamedTuple):
 
 
 class UserLaw(Protocol):
-    """Interface of a control law that a user writes in Python.
+    """Interface of a control law written by a user in Python.
 
-    The class of the law is called with a `LawContext`, which describes the arm, and with the
-    entries of the table `[control]` of the scenario as keyword arguments. The method `torque`
-    is called in each period of the control loop.
+    The class is instantiated with a `LawContext`, which describes the arm, and with the entries
+    of the scenario's table `[control]` as keyword arguments. The method `torque` is called in
+    every tick.
 
-    A law may have these attributes and methods:
+    A law may also define:
 
-    - If `torque` needs numbers from earlier periods, the law must declare them, so that a run
-      can be repeated. Either the class lists the names of these attributes in `remembers`, or a
-      method `memory()` returns the numbers and a method `recall(memory)` restores them.
-    - An attribute `theta_hat` with a number per dynamic parameter is stored in the records.
-    - `holds = True` states that the law knows the other arms only through the reference, the
-      position that its arm follows. Its torque is then also used while the arm is at rest.
+    - Its memory. State that `torque` keeps between ticks must be declared, because otherwise a
+      run could not be repeated. Either the class lists the attribute names in `remembers`, or a
+      method `memory()` returns the state vector and a method `recall(memory)` restores it.
+    - An attribute `theta_hat` with one value per dynamic parameter, which is stored in the
+      records.
+    - `holds = True`, if the law depends on the other arms only through the reference. Its
+      torque is then also used while the arm is at rest.
     """
 
     def torque(self, now: LawInput) -> Sequence[float] | None:
-        """Computes the motor torque of each joint in a period of the control loop.
+        """Computes the motor torque of each joint in one tick.
 
-        The program limits the torque to the range of the motors afterwards.
+        The returned torque is then limited to the motors' range.
 
         Args:
             now: State of the arm and of the other arms. The law may also write results into it,
-                for example numbers for other arms.
+                for example vectors for other arms.
 
         Returns:
-            The torques, N m. None if the law has written them into `now.tau`.
+            The torques, N m, or None if the law has written them into `now.tau`.
         """
 
 
@@ -233,13 +237,11 @@ UserLawFactory = Callable[[LawContext], UserLaw]
 
 
 class SiteLaw:
-    """A user's control law at one site: its calls, its memory, and its errors.
-
-    A site is the process that runs one arm.
+    """A user's control law at one site: calls the law, and handles its memory and errors.
 
     Args:
         law: An instance of the law's class.
-        site: Name of the site, for errors.
+        site: Name of the site, for error messages.
     """
 
     def __init__(self, law: UserLaw, site: str) -> None:
@@ -248,25 +250,26 @@ class SiteLaw:
 
     @property
     def name(self) -> str:
-        """Name by which a scenario selects the law, as in "mylaws:Spring"."""
+        """Name with which a scenario selects the law, for example "mylaws:Spring"."""
         kind = type(self._law)
         return f"{kind.__module__}:{kind.__qualname__}"
 
     @property
     def remembered(self) -> tuple[str, ...]:
-        """Names of the attributes that the law keeps from one control period to the next.
+        """Names of the attributes that the law keeps from one tick to the next.
 
-        The law's class lists them in `remembers`, for example `remembers = ("x",)`. The log
-        contains their values, so that a run can be repeated. Empty for a law without memory.
+        The law's class lists them in `remembers`, for example `remembers = ("x",)`. Their
+        values are stored in the log, which makes a run repeatable. Empty for a law without
+        memory.
         """
         return tuple(getattr(self._law, "remembers", ()))
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the law keeps from one control period to the next.
+        """State vector that the law keeps from one tick to the next.
 
-        They come from the law's method `memory` if it has one, otherwise from the attributes
-        that its class lists in `remembers`.
+        It is the result of the law's method `memory` if there is one, otherwise the values of
+        the attributes listed in `remembers`.
         """
         if callable(getattr(self._law, "memory", None)):
             return [float(value) for value in self._law.memory()]
@@ -277,7 +280,7 @@ class SiteLaw:
 
     @property
     def memory_names(self) -> tuple[str, ...]:
-        """A name for each number of `memory`, as "error[1]" or "memory[1]"."""
+        """Name of each entry of `memory`, for example "error[1]" or "memory[1]"."""
         if callable(getattr(self._law, "memory", None)):
             return tuple(f"memory[{n + 1}]" for n in range(len(self._law.memory())))
         names = []
@@ -288,14 +291,14 @@ class SiteLaw:
         return tuple(names)
 
     def restore(self, memory: Sequence[float]) -> None:
-        """Restores the state that the law had after a recorded control period.
+        """Restores the state of the law after a recorded tick.
 
-        A recorded run can then be continued or checked from that period. If the law has a
-        method `recall`, the numbers are passed to this method. Otherwise they are written into
-        the attributes that the class of the law lists in `remembers`.
+        A recorded run can then be continued or checked from that tick. If the law has a method
+        `recall`, the state vector is passed to this method. Otherwise its entries are assigned
+        to the attributes listed in `remembers`.
 
         Args:
-            memory: Numbers that the law remembered, from the record of the period.
+            memory: State vector from the record of the tick.
 
         Raises:
             LawFailed: The law raised an exception.
@@ -313,14 +316,14 @@ class SiteLaw:
     def call(
         self, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
     ) -> "LawResults":
-        """Calls the law for one control period, and checks its results.
+        """Calls the law for one tick, and checks its results.
 
-        If the law raises an exception or returns an unusable result, the error names the class,
-        the arm and the period.
+        If the law raises an exception or returns an unusable result, the error message names
+        the class, the arm and the tick.
 
         Args:
-            now: Input of the law in this control period.
-            collect_sent: Function that returns the numbers that the law sends to other arms.
+            now: Input of the law in this tick.
+            collect_sent: Function that returns the values that the law sends to other arms.
 
         Raises:
             LawFailed: The law raised an exception, or its results are not finite or have the
@@ -353,17 +356,16 @@ class SiteLaw:
         return results
 
     def check_results(self, tick: int, results: "LawResults") -> None:
-        """Checks that the results of the law are finite, and its memory not too large.
+        """Raises LawFailed if a result is not finite or the memory is too large.
 
-        A torque that is NaN would make the simulation useless, and a large memory would fill
-        the log.
+        A NaN torque would make the simulation useless, and a large memory would fill the log.
 
         Args:
-            tick: Number of the tick (control period), for the error.
+            tick: Number of the tick, for the error message.
             results: Results of the law.
 
         Raises:
-            LawFailed: A check fails. The error states the first problem.
+            LawFailed: A check fails. The error describes the first problem.
         """
         count = len(results.memory)
         if count > MAX_LAW_MEMORY:
@@ -379,12 +381,12 @@ class SiteLaw:
                     raise self._make_error(tick, problem)
 
     def describe_failure(self, tick: int | None, error: BaseException) -> LawFailed:
-        """Converts an exception in the law to an error with the class and the arm.
+        """Converts an exception raised by the law to an error that names the class and the arm.
 
-        The message contains the line of the user's file.
+        The message includes the line of the user's file.
 
         Args:
-            tick: Number of the tick (control period). None if the law failed outside a tick.
+            tick: Number of the tick. None if the law failed outside a tick.
             error: The exception.
         """
         problem = describe_exception(error)
@@ -396,17 +398,17 @@ class SiteLaw:
         """Returns the error for a problem with the law, which names the arm and the class.
 
         Args:
-            tick: Number of the tick (control period). None outside a tick.
-            problem: The problem, a sentence for the user.
+            tick: Number of the tick. None outside a tick.
+            problem: The problem, as a sentence for the user.
         """
         return LawFailed(problem, site=self._site, code=self.name, tick=tick)
 
 
 class LawResults(NamedTuple):
-    """Checked results of a user's control law in one control period.
+    """Checked results of a user's control law in one tick.
 
-    They are the torque of each joint, the estimate of the arm's parameters, the numbers that
-    the law keeps for the next period, and the numbers that it sends to other arms.
+    They are the torque of each joint, the parameter estimate of the arm, the memory that the
+    law keeps for the next tick, and the values sent to other arms.
     """
 
     torque: list[float]
@@ -416,10 +418,9 @@ class LawResults(NamedTuple):
 
 
 def _flatten(value: Any) -> Iterator[float]:
-    """Yields the numbers of an attribute of a control law as floats, to store them in the log.
+    """Yields the numbers in an attribute of a control law as floats, for storage in the log.
 
-    A single number gives itself. Nested lists give their numbers in order: [[1, 2], [3]] gives
-    1, 2 and 3.
+    A single number yields itself. Nested lists are flattened: [[1, 2], [3]] yields 1, 2 and 3.
     """
     if isinstance(value, Real):
         yield float(value)
@@ -429,14 +430,14 @@ def _flatten(value: Any) -> Iterator[float]:
 
 
 def _fill(value: Any, numbers: Iterator[float]) -> Any:
-    """Restores an attribute of a law from a list of numbers; the inverse of `_flatten`.
+    """Restores an attribute of a law from its numbers. Inverse of `_flatten`.
 
-    Example: the value [[1, 2], [3]] and the numbers 4, 5, 6 give [[4, 5], [6]]. Types are kept:
-    an integer stays an integer as long as its new number is integral.
+    For example, the value [[1, 2], [3]] and the numbers 4, 5, 6 result in [[4, 5], [6]]. Types
+    are preserved: an integer remains an integer if its new value is integral.
 
     Args:
-        value: Present value: a number, an array, or nested lists of numbers.
-        numbers: The new numbers. As many of them are consumed as `value` contains.
+        value: Current value: a number, an array, or nested lists of numbers.
+        numbers: The new numbers, of which as many are consumed as `value` contains.
     """
     if isinstance(value, bool):
         return bool(next(numbers))

@@ -1,6 +1,7 @@
-"""Computes one control period of an arm in eight stages, and whole simulations of all arms.
+"""Computes a control period of one arm in eight stages, or simulates whole runs of all arms.
 
-`Site.step` in `site_step` computes one period for any driver: a live session, a simulation or
-the verification of a log. `fused_run` simulates all arms in one compiled call, for studies of
-many runs. `row_fields` defines the arrays in which the state of an arm is stored.
+Every driver (a live session, a simulation, or the verification of a log) computes a control
+period by calling `Site.step` in `site_step`. For studies with many runs, `fused_run` simulates
+all arms in one compiled call. The arrays that store the state of an arm are defined in
+`row_fields`.
 """

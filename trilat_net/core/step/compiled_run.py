@@ -1,12 +1,12 @@
-"""Simulates the arms of several sites in one compiled loop, from the setups of the sites.
+"""Simulates several sites in one compiled loop, given the setup of each site.
 
-A tick is one period of the control loop. The loop does not store every tick. It stores the
-largest values of every interval of 50 ms, and sums over the run.
+Ticks are not stored individually. The loop keeps the largest values in each 50 ms interval, and
+sums over the whole run.
 
 Invariant:
-    - Two runs with the same setups may differ by a small disturbance.
-      `CompiledRun.scale_difference` multiplies this difference by a factor, for all
-      floating-point numbers of the state. Numbers that are equal in both runs do not change.
+    - Two runs with the same setups may differ by a small perturbation.
+      `CompiledRun.scale_difference` scales that difference in all floating-point values of the
+      state. Values that are equal in both runs stay equal.
 """
 
 import math
@@ -45,24 +45,23 @@ class _HandActor(Protocol):
     """Interface of a live operator in a compiled run.
 
     A live operator is a person or program that moves an arm while the run is in progress. The
-    compiled loop asks for the operator's actions in advance, for as many ticks (control
-    periods) as possible, so that it rarely has to leave compiled code.
+    compiled loop requests the operator's actions for as many ticks in advance as possible,
+    because leaving compiled code is slow.
     """
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns the operator's next actions: how firmly and where the operator pulls the arm.
 
-        The actions begin with tick `k`. A tick is one period of the site's control loop. The
-        result ends before the first tick whose action depends on a state of the arm that has
-        not been computed yet.
+        The actions start at tick `k`. They stop before the first tick whose action depends on
+        an arm state that has not been computed yet.
 
         Args:
-            k: Number of the first tick.
-            end: Number of the tick before which the result ends at the latest.
-            arrays: State of the site (arm controller) before tick `k`.
+            k: First tick.
+            end: Tick before which the actions must stop.
+            arrays: State of the site before tick `k`.
 
         Returns:
-            An array with one row per tick. A row contains the numbers of `HandInForce`.
+            An array with one row per tick. The columns are the fields of `HandInForce`.
         """
 
 
@@ -70,7 +69,7 @@ class _Plant(Protocol):
     """Interface of a user's own program that computes the motion of an arm.
 
     Attributes:
-        state: State of the arm in the next tick (control period).
+        state: State of the arm in the next tick.
     """
 
     state: PlantState
@@ -79,25 +78,23 @@ class _Plant(Protocol):
         """Moves the arm by one control period.
 
         Args:
-            tick: Number of the tick.
-            tau: Control torque ON the joints in this tick, in N m, shape (n,).
+            tick: Tick to compute.
+            tau: Control torque ON the joints during this tick, in N m, shape (n,).
         """
 
 
 class RunTotals(NamedTuple):
-    """Numbers that summarise a whole simulated run, such as its largest mean error.
-
-    `CompiledRun.totals` returns them.
+    """Summary statistics of a simulated run, as returned by `CompiledRun.totals`.
 
     Attributes:
         rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
-            is the difference between the angle of a joint and its reference. The value is the
-            largest over all joints of all sites (arm controllers).
-        effort_nm: Root mean square of tau - G(q) over sites and joints, in N m. tau is the
-            control torque, and G(q) is the torque that compensates gravity in the pose q.
-        force_peak_n: Largest force of a wall on an arm, in N. None if there is no wall.
-        walls_j: Work of the environments on the arms, in J. An environment is a wall or another
-            body that acts on an arm. None if there is no environment.
+            is the difference between a joint angle and its reference. This is the maximum over
+            all joints of all sites.
+        effort_nm: Root mean square of tau - G(q) over sites and joints, in N m, where tau is
+            the control torque and G(q) the torque that compensates for gravity in pose q.
+        force_peak_n: Largest force exerted by a wall on an arm, in N. None if there is no wall.
+        walls_j: Work done on the arms by their environments (such as walls), in J. None if
+            there is no environment.
     """
 
     rms_error_rad: float
@@ -107,34 +104,33 @@ class RunTotals(NamedTuple):
 
 
 class CompiledRun:
-    """Simulation of several arms, each with its controller (site), in one compiled loop.
+    """A simulation that runs several arms and their control laws in one compiled loop.
 
-    Control laws that can be compiled are executed within the loop. Laws in plain Python are
+    Control laws that can be compiled run inside the loop, and laws written in plain Python are
     called between the stages of a tick. The loop also pauses before each tick for which an
     operator's program needs the state of the arm, and after each tick of a site whose arm is
     moved by a user's program.
 
     Args:
-        setups: Setups of all sites, in the order of the scenario.
-        first_environments: For each site the index of the first environment among its torque
-            sources. -1 if the site has no environment.
+        setups: Setups of all sites, in scenario order.
+        first_environments: For each site, the index of its first environment among its torque
+            sources, or -1 if it has none.
         duration_s: Duration of the whole run, in s.
-        settled_rad: A site counts as settled while |e| of all joints is below this limit, in
+        settled_rad: A site counts as settled while |e| is below this limit at every joint, in
             rad.
-        keep: Number of recent records of each site that are stored for `pop_records`.
-        inputs: Inputs of a recorded run that is repeated. Without them, every sample arrives
-            promptly.
-        hands: Live operators by the index of their site. Must be empty if `inputs` is given,
-            because the inputs contain the actions.
-        plants: Users' programs that move external arms, by the index of their site.
+        keep: Number of recent records kept per site for `pop_records`.
+        inputs: Inputs of a recorded run to repeat. If omitted, every sample arrives promptly.
+        hands: Live operators, keyed by site index. Must be empty if `inputs` is given, because
+            the inputs already contain the actions.
+        plants: Users' programs that move external arms, keyed by site index.
 
     Attributes:
-        layouts: Layout of the records of each site.
+        layouts: Record layout of each site.
         rates_hz: Tick rate of each site, in Hz.
         duration_s: Duration of the whole run, in s.
-        ran_s: Time up to which `advance_to` has executed the run, in s.
-        pending_deliveries: Function that updates the state of the links, if the run was
-            advanced together with other runs. It is called before the run continues alone.
+        ran_s: Time up to which `advance_to` has simulated the run, in s.
+        pending_deliveries: Function that brings the link state up to date if the run was
+            advanced together with other runs. It is called before the run continues on its own.
     """
 
     def __init__(
@@ -163,7 +159,7 @@ class CompiledRun:
         self.layouts = [setup.layout for setup in setups]
         self.rates_hz = [setup.rate_hz for setup in setups]
         self._links = [setup.links for setup in setups]
-        # The samples that each site uses in all ticks, computed when they are read.
+        # The samples that each site uses in all ticks. They are computed on demand.
         self._used: dict[int, IntArray] = {}
         self._plug_laws(setups)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
@@ -188,18 +184,17 @@ class CompiledRun:
         self._selected: dict[int, SiteArrays] = {}
 
     def _allocate_records(self, keep: int) -> RecentRecords:
-        """Allocates memory for the recent records of every site (arm controller).
+        """Allocates memory for the recent records of every site.
 
-        A record is the stored result of one tick (period of the control loop). It must be
-        stored until `pop_records` returns it, until the slowest peer has received it, and, in a
-        repeated run, until the latest sample (sent state) has arrived.
+        A record must be kept until `pop_records` returns it, until the slowest peer has
+        received it, and, in a repeated run, until the latest sample has arrived.
 
         Args:
-            keep: Number of recent records of each site that `pop_records` must find.
+            keep: Number of recent records per site that `pop_records` must be able to return.
 
         Returns:
-            Ring buffers for at least as many records per site as are needed. Their length is a
-            power of two, so that the compiled loop finds the position of a tick with a bit
+            Ring buffers for at least the required number of records per site. Their length is a
+            power of two, so that the compiled loop can find the position of a tick with a bit
             mask.
         """
         site_count = len(self.layouts)
@@ -220,17 +215,17 @@ class CompiledRun:
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
         """Creates the users' control laws, and connects them to the arrays of the run.
 
-        A law that can be compiled is called within the compiled loop. A law in plain Python is
-        called between the stages of a tick (control period). The laws are stored in
-        `self._laws`, and the arrays that the compiled loop needs in `self._law_arrays`, which
-        stays None without users' laws.
+        A law that can be compiled is called inside the compiled loop. A law in plain Python is
+        called between the stages of a tick. The laws are stored in `self._laws`, and the arrays
+        needed by the compiled loop in `self._law_arrays`, which stays None if there are no user
+        laws.
 
         Args:
-            setups: Setups of the sites (arm controllers), in the order of the scenario.
+            setups: Setups of the sites, in scenario order.
         """
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
-        # The arrays for numbers that laws send exist only if a site has a user's law.
+        # The arrays for values sent by laws exist only if a site has a user's law.
         has_user_laws = self._tables.channel is not None
         if not has_user_laws:
             return
@@ -278,21 +273,20 @@ class CompiledRun:
         )
 
     def _update_links(self) -> None:
-        """Updates the state of the links, if the run was advanced together with other runs."""
+        """Brings the link state up to date if the run was advanced together with other runs."""
         deliver = self.pending_deliveries
         self.pending_deliveries = None
         if deliver is not None:
             deliver()
 
     def step_to(self, last_ns: int) -> None:
-        """Executes all planned ticks up to a time, and applies the changes up to that time.
+        """Executes all planned ticks up to a given time, and applies the changes due by then.
 
-        Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
-        its limits.
+        Does nothing if a site has diverged, meaning that its arm has left its limits.
 
         Args:
-            last_ns: Time of the last tick (control period) to be executed, in ns after the
-                epoch. The epoch is the common start time of the sites.
+            last_ns: Time of the last tick to execute, in ns since the epoch (the common start
+                time of the sites).
 
         Raises:
             LawFailed: A user's control law failed.
@@ -310,16 +304,15 @@ class CompiledRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, and calls users' programs in between.
+        """Executes the planned ticks up to a given time, calling users' programs in between.
 
         The programs act as operators, or compute the motion of an arm (plants). A program needs
-        the state of the arm at a certain time, so the compiled loop pauses before the tick
-        (control period) of this time to call the program. Between two pauses, the loop executes
-        many ticks at once.
+        the state of the arm at a certain time, so the compiled loop pauses before the tick at
+        that time. Between pauses, it executes many ticks at once.
 
         Args:
-            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
-                start time of the sites.
+            last_ns: Time of the last tick to execute, in ns since the epoch (the common start
+                time of the sites).
         """
         while self.has_programs and self.diverged_s is None:
             # Both methods call a program if it is due, and return when it is due again.
@@ -338,15 +331,15 @@ class CompiledRun:
     def _move_plant(self, i: int) -> int:
         """Calls a user's program to compute the motion of an arm in one control period.
 
-        Such a program is called a plant, and a control period a tick. The plant moves once per
-        tick, by the control torque of the last executed tick. The new state of the arm is
-        copied to the arrays of the run, from which the next tick reads it.
+        The program, called a plant, moves the arm once per tick, driven by the control torque
+        of the last executed tick. The new state of the arm is copied to the arrays of the run,
+        from which the next tick reads it.
 
         Args:
             i: Index of the site.
 
         Returns:
-            Time before which the plant must move again, in ns after the epoch. `NEVER_NS` after
+            Time before which the plant must move again, in ns since the epoch. `NEVER_NS` after
             the last tick.
         """
         next_tick = int(self._progress[i]["tick"])
@@ -373,16 +366,16 @@ class CompiledRun:
         return tick_ns(next_tick + 1, self.rates_hz[i])
 
     def _request_actions(self, i: int) -> int:
-        """Requests the next actions of an operator, if the previous actions were executed.
+        """Requests the next actions of an operator once the previous ones have been executed.
 
-        The operator is a program that answers with its actions for some ticks (periods of the
-        control loop) in advance. They are written to the inputs of the compiled loop.
+        The operator is a program that returns its actions for several ticks in advance. They
+        are written to the inputs of the compiled loop.
 
         Args:
             i: Index of the site.
 
         Returns:
-            Time at which the operator needs the state of the arm again, in ns after the epoch.
+            Time at which the operator needs the state of the arm again, in ns since the epoch.
             `NEVER_NS` after the last tick.
         """
         progress = self._progress[i]
@@ -397,15 +390,14 @@ class CompiledRun:
         return tick_ns(self._action_ends[i], self.rates_hz[i])
 
     def _step_piece(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time for which no user's program is needed.
+        """Executes the planned ticks up to a time until which no operator or plant is needed.
 
-        Such programs are operators and plants (simulated arms). Control laws are called. If a
-        user's law is plain Python, the loop over the ticks (control periods) runs in Python
-        too. Otherwise the whole loop is compiled.
+        Control laws are still called. If a user's law is in plain Python, the loop over the
+        ticks also runs in Python. Otherwise, the entire loop is compiled.
 
         Args:
-            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
-                start time of the sites.
+            last_ns: Time of the last tick to execute, in ns since the epoch (the common start
+                time of the sites).
 
         Raises:
             LawFailed: A user's control law failed.
@@ -432,7 +424,7 @@ class CompiledRun:
         except LawFailed:
             raise
         except Exception as error:
-            # A compiled law may raise any error. Each law can tell whether it raised the error.
+            # A compiled law may raise any error. Each law knows whether it raised the error.
             failures = [law.find_failure(error) for law in compiled]
             law_failures = filter(None, failures)
             # An error that no law caused is raised unchanged.
@@ -441,11 +433,11 @@ class CompiledRun:
     def _run_plain_until(self, last_ns: int) -> None:
         """Executes ticks in a Python loop, because a control law is not compiled.
 
-        The loop does the same as the compiled function `run_until`. Within each tick, the law
+        The loop is equivalent to the compiled function `run_until`. Within each tick, the law
         is called after the measurements (`sense_site`) and before the motion (`finish_site`).
 
         Args:
-            last_ns: Time of the last tick, in ns after the epoch.
+            last_ns: Time of the last tick, in ns since the epoch.
         """
         progress = self._progress
         tables = self._tables
@@ -479,15 +471,15 @@ class CompiledRun:
                     laws=self._law_arrays,
                 )
                 if mode == Mode.DIVERGED:
-                    # The other ticks of this time are still executed.
+                    # The other ticks at this time are still executed.
                     progress[i]["diverged_ns"] = t_ns
                     last_ns = t_ns
 
     def advance_to(self, until_s: float) -> None:
         """Continues the run up to the last tick of a run that lasts `until_s` seconds.
 
-        Nothing happens if a site (arm controller) has diverged, that is, if its arm has left
-        its limits. Nothing happens either if the run has already passed this tick.
+        Does nothing if the run is already past that tick, or if a site has diverged (its arm
+        has left its limits).
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
@@ -496,15 +488,14 @@ class CompiledRun:
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     def plan(self, ticks: Sequence[int]) -> None:
-        """Sets how many ticks each site will execute in total, and allocates memory for them.
+        """Sets the total number of ticks of each site, and allocates memory for them.
 
-        A tick is a period of a site's control loop. The memory for the largest values in
-        intervals of 50 ms (buckets), and for the actions of live operators, is enlarged. Values
-        that it contains are kept.
+        This enlarges the arrays that hold the largest values per 50 ms interval (bucket) and
+        the actions of live operators, and keeps their contents.
 
         Args:
-            ticks: Total number of ticks of each site (arm controller), in the order of the
-                scenario. Ticks that have already been executed are included.
+            ticks: Total number of ticks per site, in scenario order, including ticks that have
+                already been executed.
         """
         progress: Row
         for progress, planned_ticks in zip(self._progress, ticks, strict=True):
@@ -529,7 +520,7 @@ class CompiledRun:
 
     @cached_property
     def _state(self) -> RunState:
-        """State of the run, with which it can be copied to another run."""
+        """State of the run, in a form that can be copied to another run."""
         tables = self._tables
         arrays = [self._progress, self._next_samples, *self._sent, self._sums]
         arrays += [array for array in tables if isinstance(array, np.ndarray)]
@@ -541,39 +532,40 @@ class CompiledRun:
 
     @property
     def has_programs(self) -> bool:
-        """True if users' own programs act as operators, or compute the motion of an arm.
+        """True if a user's own program acts as an operator or computes the motion of an arm.
 
-        The run cannot be copied then, because the state of such programs is not part of the
-        state of the run.
+        Such a run cannot be copied, because the state of the program is not part of the run's
+        state.
         """
         return bool(self._hands or self._plants)
 
     @property
     def programmed_sites(self) -> set[int]:
-        """Indices of the sites (arm controllers) whose operator or arm is a user's own program.
+        """Indices of the sites whose operator or arm is a user's own program.
 
-        Such a program is called in Python in each control period, which is slower.
+        These programs are called from Python in every control period, which is slower.
         """
         return {*self._hands, *self._plants}
 
     def copy_state(self, other: "CompiledRun") -> None:
-        """Makes this simulated run continue from exactly the same state as another run.
+        """Overwrites the state of this run with an exact copy of the state of another run.
 
         Both runs must have the same scenario and the same planned control periods. The other
-        run does not change.
+        run is not changed.
         """
         self.scale_difference(other, 0.0)
 
     def scale_difference(self, other: "CompiledRun", factor: float) -> None:
         """Multiplies the difference between the states of this run and another run by a factor.
 
-        Every floating-point number x of the state becomes x_other + factor (x - x_other), see
-        `RunState.scale_difference`. This is not possible if operators or arms are users'
-        programs, because the state of such programs is not known.
+        Every floating-point value x of the state becomes x_other + factor (x - x_other); see
+        `RunState.scale_difference`. This is not possible if an operator or an arm is a user's
+        program, because the state of the program is unknown.
 
         Args:
-            other: The other run. It must have the same scenario, and be at the same time.
-            factor: Number by which the difference is multiplied.
+            other: The other run, which must have the same scenario and have reached the same
+                time.
+            factor: Scale factor applied to the difference.
         """
         assert not self.has_programs
         self._update_links()
@@ -589,16 +581,15 @@ class CompiledRun:
                 law.restore(mixed.tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns the state of one simulated arm and its controller (site), as NumPy arrays.
+        """Returns the state of one site before its next tick, as NumPy arrays.
 
-        It is the state before the next tick, a period of the control loop. The arrays belong to
-        the simulation, so the caller must not change them.
+        The arrays belong to the simulation and must not be modified.
 
         Args:
-            i: Index of the site in the order of the scenario.
+            i: Index of the site in scenario order.
 
         Returns:
-            Views of the arrays, without copies.
+            Views of the arrays, not copies.
         """
         self._update_links()
         if i not in self._selected:
@@ -608,40 +599,36 @@ class CompiledRun:
     def displace(self, field: str, offsets: Array) -> None:
         """Adds offsets to one field of the state of all sites, for example to the joint angles.
 
-        Twins, repeated runs with a small disturbance, are disturbed in this way.
+        This is how the small perturbation is applied to a twin (a repeat of the run).
 
         Args:
-            field: Name of the field, for example "q" for the joint angles or "qd" for the
-                velocities.
-            offsets: Numbers to add, one row per site (arm controller), shape (N, n). The unit
-                is that of the field.
+            field: Field name, for example "q" for the joint angles or "qd" for the velocities.
+            offsets: Offsets to add, one row per site, shape (N, n), in the unit of the field.
         """
         self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "CompiledRun", field: str) -> float:
-        """Returns the distance between the states of this simulation and another, in one field.
+        """Returns the distance between this simulation and another in one field of their state.
 
         Args:
-            other: The other run of the same scenario.
-            field: Name of the field, for example "qd" for the joint velocities.
+            other: Another run of the same scenario.
+            field: Field name, for example "qd" for the joint velocities.
 
         Returns:
-            The largest absolute difference over all sites (arm controllers) and joints, in the
-            unit of the field.
+            The largest absolute difference over all sites and joints, in the unit of the field.
         """
         difference = self._tables.site[field] - other._tables.site[field]
         return float(np.abs(difference).max())
 
     def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
-        """Continues the simulation, and returns the states at 100 times of its last quarter.
+        """Continues the simulation, and samples its state 100 times during the last quarter.
 
         Args:
             until_s: Time at which the run ends, in s.
 
         Returns:
             The joint angles q in rad, shape (100, N, n), and the estimated parameters
-            theta_hat, shape (100, N, P). N is the number of sites (arm controllers), n the
-            number of joints, and P the number of parameters.
+            theta_hat, shape (100, N, P), for N sites, n joints and P parameters.
         """
         q = []
         theta_hat = []
@@ -661,9 +648,9 @@ class CompiledRun:
     def settled_s(self) -> float | None:
         """Time from which the synchronisation errors of all sites stay small, in s.
 
-        The error e of a site (arm controller) is the difference between its joint angles and
-        their reference. It counts as small if |e| of every joint is below `settled_rad`. None
-        if the limit is exceeded in the last tick (control period).
+        The error e is the difference between the joint angles and their reference. It counts as
+        small if |e| is below `settled_rad` at every joint. None if the limit is exceeded in the
+        last tick.
         """
         last_site = int(np.argmax(self._progress["unsettled_ns"]))
         progress: Row = self._progress[last_site]
@@ -675,13 +662,12 @@ class CompiledRun:
 
     @property
     def buckets(self) -> tuple[Array, ...]:
-        """Largest errors and speeds in intervals of 50 ms, with one array for each site.
+        """Largest errors and speeds in each 50 ms interval, as one array per site.
 
-        Each array has the shape (intervals, 3 n), where n is the number of joints. A row
-        contains the largest synchronisation error |e| of each joint in rad, the largest speed
-        |qd| of each joint in rad/s, and the last angle q of each joint in rad. An interval
-        without a tick (control period) of the site (arm controller) contains -1. The last
-        interval may be incomplete.
+        Each array has shape (intervals, 3 n) for n joints. A row contains the largest
+        synchronisation error |e| of each joint in rad, then the largest speed |qd| of each
+        joint in rad/s, then the last angle q of each joint in rad. Intervals that contain no
+        tick of the site are filled with -1. The last interval may be incomplete.
         """
         buckets = []
         for peaks, progress in zip(self._peaks, self._progress, strict=True):
@@ -692,9 +678,9 @@ class CompiledRun:
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest error and largest speed of each arm, in every interval of 50 ms.
+        """Largest error and speed of each arm in every 50 ms interval.
 
-        There is one array per arm, of the shape (intervals, 2). The columns are the largest
+        There is one array per arm, of shape (intervals, 2). The columns are the largest
         synchronisation error |e| of any joint in rad, and the largest joint speed |qd| in
         rad/s.
         """
@@ -702,10 +688,10 @@ class CompiledRun:
 
     @property
     def totals(self) -> RunTotals:
-        """Numbers that summarise the simulated run so far, such as the largest mean error.
+        """Statistics of the run so far, such as the largest RMS error and the control effort.
 
-        They also contain the control effort, and the forces and work of walls and dampers. See
-        `RunTotals` for the definitions.
+        They also include the forces and work of walls and dampers. See `RunTotals` for
+        definitions.
         """
         sums = self._sums
         ticks = self._progress["tick"].astype(np.float64)
@@ -730,24 +716,23 @@ class CompiledRun:
     def q(self) -> Array:
         """Joint angles of all arms after the last control period, in rad, shape (N, n).
 
-        N is the number of sites (one per arm), and n is the number of joints of each arm.
+        N is the number of sites, and n the number of joints per arm.
         """
         return np.array(self._tables.site["q"][:, 0])
 
     @property
     def theta_hat(self) -> Array:
-        """Arm parameters that adaptive control laws have estimated so far, shape (N, P).
+        """Current arm parameter estimates of the adaptive control laws, shape (N, P).
 
-        N is the number of sites (one per arm), and P is the number of parameters.
+        N is the number of sites, and P the number of parameters.
         """
         return np.array(self._tables.site["theta_hat"][:, 0])
 
     @property
     def memories(self) -> list[Array]:
-        """Internal state of each control law that a user has written, after the last tick.
+        """Internal state of each user-written control law after the last tick.
 
-        A tick is one period of the control loop. There is one array per site (simulated process
-        that runs one arm). The array of a site with a built-in law is empty.
+        There is one array per site; the array of a site with a built-in law is empty.
         """
         memories = []
         for i in range(len(self._progress)):
@@ -757,24 +742,24 @@ class CompiledRun:
 
     @property
     def tau_x(self) -> list[Array]:
-        """External torque on each arm in the last control period, in N m, without the motors.
+        """External torque on each arm in the last control period, in N m, excluding the motors.
 
-        The list has one array of the shape (n,) per site, for n joints. Operators and
-        environments exert the torque.
+        The torque comes from operators and environments. The list contains one array of shape
+        (n,) per site, for n joints.
         """
         pairs = zip(self.records, self.layouts, strict=True)
         return [row[layout.columns()["tau_x"]] for row, layout in pairs]
 
     def pop_records(self) -> list[tuple[IntArray, Array]]:
-        """Returns the records that each site (arm controller) has produced since the last call.
+        """Returns the records that each site has produced since the last call.
 
-        A record is the stored result of one tick (control period). Only a limited number of
-        recent records is stored (see `keep` of the constructor). Older records are lost.
+        Only the most recent records are kept (see `keep` in the constructor). Older ones are
+        lost.
 
         Returns:
             For each site, the nominal times of the records in ns, shape (K,), and the records,
-            shape (K, floats). The columns of the records are those of `Layout.columns`. K is 0
-            if there are no new records.
+            shape (K, floats), with columns as in `Layout.columns`. K is 0 if there are no new
+            records.
         """
         records = []
         pages = self._sent.t_ns.shape[1]
@@ -794,10 +779,10 @@ class CompiledRun:
         return self.ran_s >= self.duration_s or self.diverged_s is not None
 
     def find_batch_end(self) -> float:
-        """Returns the time up to which the run may continue before its records are read, in s.
+        """Returns how far the run may continue before its records must be read, as a time in s.
 
-        Up to this time, no site (arm controller) produces more records than the run stores, see
-        `keep` of the constructor. The result is at most the duration of the scenario.
+        Until then, no site produces more records than the run keeps (see `keep` in the
+        constructor). The result never exceeds the duration of the scenario.
         """
         fastest_hz = max(self.rates_hz)
         return min(self.ran_s + (self._keep - 1) / fastest_hz, self.duration_s)
@@ -805,11 +790,11 @@ class CompiledRun:
     def iterate_batches(self) -> Iterator[list[tuple[IntArray, Array]]]:
         """Simulates the scenario to its end, and yields all records batch by batch.
 
-        A long run thus needs memory for the latest `keep` records of each site (arm controller)
-        only. `keep` must be at least 2.
+        Even a long run only needs memory for the latest `keep` records of each site. `keep`
+        must be at least 2.
 
         Yields:
-            The records since the previous batch, in the form of `pop_records`.
+            The records since the previous batch, in the same form as `pop_records`.
         """
         while not self.is_finished:
             self.advance_to(self.find_batch_end())
@@ -818,17 +803,17 @@ class CompiledRun:
     def read_samples_in_use(self, i: int, count: int) -> IntArray:
         """Returns which samples a site used in its latest ticks, shape (count, peers).
 
-        A sample is the state that a peer, another site, sent in one of its ticks. The samples
-        follow from the delays of the links alone, so they are computed again and not stored.
-        The run must not repeat a log, because its samples would then arrive as recorded.
+        Which samples are used depends only on the link delays, so the result is recomputed
+        instead of stored. It is not valid for a run that repeats a log, where samples arrive as
+        recorded.
 
         Args:
             i: Index of the site.
-            count: Number of ticks, at most the number of executed ticks.
+            count: Number of ticks, at most the number of ticks executed.
 
         Returns:
-            For each tick of the site, the ticks in which the peers sent the samples. -1 before
-            the first sample of a peer.
+            For each tick of the site, the ticks in which the peers sent the samples, or -1
+            before the first sample of a peer.
         """
         stop = int(self._progress[i]["tick"])
         if i not in self._used or len(self._used[i]) < stop:
@@ -842,10 +827,7 @@ class CompiledRun:
 
     @property
     def records(self) -> Array:
-        """Results of the last control period (tick) of each site, one row per site.
-
-        A site is the controller of one arm. For the columns see `Layout.columns`.
-        """
+        """Latest record of each site, one row per site, with columns as in `Layout.columns`."""
         return np.array([self._last_row(i) for i in range(len(self._progress))])
 
     def _last_row(self, i: int) -> Array:
@@ -857,16 +839,16 @@ class CompiledRun:
 
 
 def _max_over_joints(buckets: Array) -> Array:
-    """Returns the largest position error and joint speed of an arm in each interval of time.
+    """Returns the largest position error and joint speed of an arm in each time interval.
 
-    The largest values are kept per joint during the simulation, and combined here for a figure
-    or table.
+    During the simulation, the largest values are kept per joint. They are combined here for a
+    figure or table.
 
     Args:
-        buckets: Statistics of an arm with n joints in K intervals of time, which are called
-            buckets, shape (K, 3 n). `run_until` writes them. Each row consists of three groups
-            of n columns, one column per joint: the largest position error |e| in rad, the
-            largest joint speed |qd| in rad/s, and the last joint angle q in rad.
+        buckets: Statistics of an arm with n joints in K time intervals (buckets), as written by
+            `run_until`, shape (K, 3 n). Each row consists of three groups of n columns, one
+            column per joint: the largest position error |e| in rad, the largest joint speed
+            |qd| in rad/s, and the last joint angle q in rad.
 
     Returns:
         The largest |e| in rad and the largest |qd| in rad/s over all joints, shape (K, 2).

@@ -1,19 +1,19 @@
 """Computes the joint torques of the built-in control laws for the planar two-link arm.
 
 There are two kinds of law. The adaptive law estimates the dynamic parameters of its arm, such
-as masses, while it controls the arm. The other laws know the gravity torque of the arm and
-compensate it. They add damping (P+d), damping and a derivative term (PD+d), or the force that a
-remote arm feels. `chain_stages` has the same laws for chains of joints.
+as masses, while controlling the arm. The other laws know the gravity torque of the arm and
+compensate for it. They add damping (P+d), damping and a derivative term (PD+d), or the force
+felt by a remote arm. `chain_stages` implements the same laws for chains of joints.
 
-Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad; the
-convergence rate Lambda in 1/s) or per dynamic parameter. Angles are in rad, speeds in rad/s,
-torques in N m. The regressor is the matrix whose product with the dynamic parameters is the
-torque of the arm's dynamics.
+Gains are diagonal matrices, stored as vectors with one entry per joint (N m s/rad; 1/s for the
+convergence rate Lambda) or per dynamic parameter. Angles are in rad, speeds in rad/s and
+torques in N m. The regressor is the matrix that yields the torque of the arm's dynamics when
+multiplied by the dynamic parameters.
 
 Invariant:
     - The errors and the regressor are computed before the estimate is updated, and do not
-      depend on the new estimate. Therefore the second-order update of the estimate needs no
-      equation to be solved.
+      depend on the new estimate. The second-order update of the estimate therefore does not
+      require solving an equation.
 
 Source: Eq. (9)-(13) and (15) of the paper on which this project is based
 (docs/reference/references.md); P+d and PD+d after Nuno, Basanez, Ortega and Spong, "Position
@@ -29,18 +29,18 @@ from .jit import leaf
 from .vectors import Five, Pair, Vector
 
 ROBUST_RESIDUE = ((5.0**0.5 - 1.0) / 2.0) ** 2.5
-"""The largest value of x - x^2 / sqrt(1 + x^2) for x >= 0."""
+"""Maximum of x - x^2 / sqrt(1 + x^2) for x >= 0."""
 
 
 @leaf
 def control_errors(
     q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector
 ) -> tuple[Pair, Pair, Pair]:
-    """Computes the errors that a control law reduces, for each joint of the planar arm.
+    """Computes the errors that a control law acts on, for each joint of the planar arm.
 
         e = q - q_des,  ed = qd - qd_des,  r = qd + Lambda e        Eq. (9), (18), (10)
 
-    Here q_des is the reference, the position that the arm follows, and r is the filtered error.
+    Here q_des is the reference (the position to follow), and r is the filtered error.
 
     Args:
         q: Joint angles, shape (2,), rad.
@@ -65,16 +65,13 @@ def control_errors(
 def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
     """Computes Y' r, which drives the parameter estimate of the adaptive control law.
 
-    Y is the regressor, the 2 x 5 matrix whose product with the five parameters of the planar
-    arm is its torque. r is the filtered tracking error.
-
     Args:
-        Y: Regressor of the planar arm, two rows of five numbers. Y theta is the joint torque of
-            an arm with the dynamic parameters theta.
+        Y: Regressor of the planar arm, two rows with five entries each. Y theta is the joint
+            torque of an arm with dynamic parameters theta.
         r: Filtered tracking error, shape (2,), rad/s.
 
     Returns:
-        Five numbers, one for each parameter.
+        One entry per parameter.
     """
     first, second = Y
     r_1 = r[0]
@@ -97,7 +94,7 @@ def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector)
     Gamma is the adaptation gain, Y the regressor and r the filtered tracking error.
 
     Args:
-        theta_hat: Estimate of the parameters before the step, shape (5,).
+        theta_hat: Parameter estimate before the step, shape (5,).
         gain_s: Duration of the step, s.
         Gamma: Adaptation gain per parameter, shape (5,).
         Yr: Product Y' r of the regressor and the filtered error, shape (5,).
@@ -113,7 +110,7 @@ def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector)
 
 @leaf
 def limit_torque(torque: float, limit: float) -> float:
-    """Returns a torque limited to what a motor can exert, from -limit to limit."""
+    """Clips a torque to the range that a motor can exert, from -limit to limit."""
     return min(max(torque, -limit), limit)
 
 
@@ -131,14 +128,14 @@ def adaptive_torque(
 
         tau = Y theta_hat - Kp r - Kd ed
 
-    The first term is the torque that the arm needs according to the estimate theta_hat of its
-    parameters. The other terms damp the errors.
+    The first term is the torque that the arm needs according to the estimated parameters
+    theta_hat. The other terms damp the errors.
 
     Args:
-        Y: Regressor Y(q, qd, -Lambda e, -Lambda ed), two rows of five numbers.
-        theta_hat: Estimate of the parameters, shape (5,).
+        Y: Regressor Y(q, qd, -Lambda e, -Lambda ed), two rows with five entries each.
+        theta_hat: Parameter estimate, shape (5,).
         Kp: Damping of the filtered error, per joint, N m s/rad.
-        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        Kd: Damping of the error velocity, per joint, N m s/rad.
         r: Filtered error, rad/s, see `control_errors`.
         ed: Derivative of the error, rad/s.
         limit: Largest torque of a joint, N m.
@@ -158,9 +155,9 @@ def adaptive_torque(
 def robust_torque(rho: float, width: float, r: float) -> float:
     """Returns rho r / sqrt(r^2 + width^2), a torque that opposes a bounded disturbance.
 
-    The robust torque is a smooth form of rho sign(r), and the law subtracts it. If the
-    disturbance d of the joint has at most the magnitude rho, the power (d - robust torque) r
-    that remains is at most ROBUST_RESIDUE rho width.
+    The robust torque is a smooth version of rho sign(r), and is subtracted by the control law.
+    If the disturbance d of the joint is at most rho in magnitude, the remaining power (d -
+    robust torque) r is at most ROBUST_RESIDUE rho width.
 
     Args:
         rho: Largest robust torque, N m.
@@ -173,7 +170,7 @@ def robust_torque(rho: float, width: float, r: float) -> float:
 
 @leaf
 def _clip(value: float, low: float, high: float) -> float:
-    """Returns a value, limited to the range from low to high. NaN stays NaN."""
+    """Clips a value to the range from low to high. NaN stays NaN."""
     if value < low:
         return low
     return high if value > high else value
@@ -181,15 +178,15 @@ def _clip(value: float, low: float, high: float) -> float:
 
 @leaf
 def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
-    """Returns an estimate of the arm's parameters, with each parameter limited to its range.
+    """Clips an estimate of the arm's parameters, limiting each parameter to its range.
 
-    The stability proof still holds with this projection: if the adaptation gain Gamma is
-    diagonal and the true parameters theta are within the limits, the projection never increases
-    (theta_hat - theta)' Gamma^-1 (theta_hat - theta). The energy function V of the proof, which
-    contains this term, therefore still never rises.
+    The stability proof still holds with this projection. If the adaptation gain Gamma is
+    diagonal and the true parameters theta are within the bounds, the projection never increases
+    (theta_hat - theta)' Gamma^-1 (theta_hat - theta). The energy function V of the proof
+    contains this term, so V still never rises.
 
     Args:
-        theta_hat: Estimate of the parameters, shape (5,).
+        theta_hat: Parameter estimate, shape (5,).
         low: Lower bound of each parameter.
         high: Upper bound of each parameter.
     """
@@ -221,22 +218,22 @@ def damped_torque(
 
         tau = G(q) - K e - d qd - Kd ed + k_f felt
 
-    G is the gravity torque and e = q - q_des the position error. The gains select the law:
+    G is the gravity torque and e = q - q_des the position error. The law depends on which gains
+    are nonzero:
 
-    - P+d: Kd = k_f = 0. For N sites with reversible dominance factors (the weights alpha with
-      which the sites follow each other), one K, one d and one constant delay T, the linearised
-      loop is stable for all masses if d >= max(abs(lambda_min(alpha)), 0.2172) K T. Two sites
-      are stable if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other dominance factors no bound of
-      this form exists.
+    - P+d: Kd = k_f = 0. For N sites with reversible dominance factors, the same K and d at
+      every site, and the same constant delay T on every link, the linearised loop is stable for
+      all masses if d >= max(abs(lambda_min(alpha)), 0.2172) K T. Two sites are stable if 4 d_1
+      d_2 > (T_1 + T_2)^2 K_1 K_2. No bound of this form exists for other dominance factors.
     - PD+d: k_f = 0.
     - Direct force reflection: Kd = 0, with K and d at the slave, d and k_f at the master.
 
     Args:
-        theta: Parameters that the law assumes for the arm, shape (5,).
+        theta: Arm parameters assumed by the law, shape (5,).
         g: Gravitational acceleration, m/s^2.
         K: Stiffness, per joint, N m/rad.
         d: Damping of the arm's own velocity, per joint, N m s/rad.
-        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        Kd: Damping of the error velocity, per joint, N m s/rad.
         k_f: Gain of the reflected force, per joint, dimensionless.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.

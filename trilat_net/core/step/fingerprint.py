@@ -1,8 +1,8 @@
-"""Computes a fingerprint of the platform's arithmetic, which tells if runs repeat exactly.
+"""Computes a fingerprint of the platform's arithmetic, to tell whether a run repeats exactly.
 
-Results of the same program can differ in the last bit between platforms. A log of a run
-contains the fingerprint of the platform that wrote it. When a log is verified, the run is
-computed again. The results must be equal to the last bit only if the fingerprint of the present
+The same program can produce results that differ in the last bit between platforms. Every log
+contains the fingerprint of the platform that wrote it. Verifying a log recomputes the run, and
+its results are required to match to the last bit only if the fingerprint of the current
 platform is the same (law L5 of docs/develop/design.md).
 
 The fingerprint is a hash of the results of a fixed computation: many sines and cosines, and a
@@ -30,23 +30,23 @@ _LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000
 
 @leaf
 def _compute_sines(angles: Array, results: Array) -> None:
-    """Computes the sine and the cosine of many angles, whose bits the fingerprint covers.
+    """Computes the sines and cosines that go into the fingerprint.
 
-    These are the operations in which platforms are most likely to differ.
+    Of all operations, these are the most likely to differ between platforms.
 
     Args:
         angles: The angles, shape (n,), rad.
-        results: Array of the shape (2, n). Its first row receives the sines, its second the
-            cosines.
+        results: Output array of shape (2, n), for the sines in the first row and the cosines in
+            the second.
     """
     for n in range(angles.shape[0]):
         results[0, n], results[1, n] = sincos(angles[n])
 
 
 def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
-    """Returns the setup of one of the two arms in the simulation of the fingerprint.
+    """Returns the setup of one of the two arms simulated for the fingerprint.
 
-    The numbers are arbitrary, but must never change: the fingerprint depends on them.
+    The values are arbitrary, but must never change, because the fingerprint depends on them.
 
     Args:
         name: Name of the site.
@@ -94,11 +94,10 @@ def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
 
 @cache
 def compute_fingerprint() -> str:
-    """Returns a fingerprint of the arithmetic of this platform, sixteen hexadecimal digits.
+    """Returns a fingerprint of this platform's arithmetic, as sixteen hexadecimal digits.
 
-    Two platforms with the same fingerprint can be expected to compute the same bits. It is a
-    hash of many sines and cosines, and of a short simulation of two arms that follow each
-    other.
+    Two platforms with the same fingerprint can be expected to compute bit-identical results.
+    See the module docstring for what is hashed.
     """
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))

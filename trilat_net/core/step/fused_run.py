@@ -1,15 +1,15 @@
-"""Simulates all arms of an experiment in one compiled call, for studies of many runs.
+"""Simulates all arms of an experiment in one compiled call, for studies with many runs.
 
-A parameter sweep needs thousands of runs, but only a few figures of each. Therefore such a run
-writes no log. It keeps only the largest errors and speeds and a few sums. The clock of the
-simulation jumps from one tick (period of the control loop of an arm) to the next.
+A parameter sweep needs thousands of runs, but only a few figures from each, so these runs write
+no log. They only keep the largest errors and speeds, and a few sums. The simulation clock jumps
+from one tick to the next.
 
 Invariant:
 
 - The call uses the same compiled functions as `Site.step`, which computes a single tick.
-- The ticks are computed in the same order as in an ordinary run in virtual time: by nominal
-  time, and at equal times in the order of the sites in the scenario file.
-- The numbers are equal to those of an ordinary run, bit for bit.
+- Ticks are computed in the same order as in an ordinary run in virtual time: by nominal time,
+  and for equal times in the order of the sites in the scenario file.
+- The results are bit-identical to those of an ordinary run.
 """
 
 from functools import cache
@@ -30,23 +30,22 @@ from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
 
 NEVER_NS = 2**63 - 1
-"""Replaces the time of the next control period once an arm has completed its run, ns."""
+"""Used as the time of the next control period once an arm has completed its run, ns."""
 
 PROGRESS_DTYPE = row_dtype("progress", {})
-"""The layout of a site's progress, see `ProgressRow`."""
+"""Memory layout of a site's progress, see `ProgressRow`."""
 
 
 class RecentRecords(NamedTuple):
-    """Latest states that an arm's process has computed, for the other arms that receive them.
+    """The latest records of a site, kept until all peers have received them.
 
-    A record contains the numbers that are computed in one period of the control loop. It is
-    kept only as long as a delayed message may still need it. The arrays are ring buffers. For
-    several arms, they have an additional first axis.
+    A record stays in this ring buffer only as long as a delayed message may still need it. For
+    several sites, the arrays have an additional leading axis.
 
     Attributes:
         t_ns: Times of the records, in ns since the start of the session. The length is a power
             of two.
-        rows: Floating-point numbers of the records, one row per record, see `Layout.columns`.
+        rows: Floating-point values of the records, one row per record, see `Layout.columns`.
     """
 
     t_ns: IntArray
@@ -70,30 +69,26 @@ _DIVERGED = int(Mode.DIVERGED)
 
 @leaf
 def first_sent_column(s: SiteRow) -> int:
-    """Returns the first column of a record with values that the control law sends.
-
-    A record is the row of floats that an arm's process computes in one control period.
-    """
+    """Returns the first column of a record that holds values sent by the control law."""
     shared_vectors = 5 if s.task else 2
     return 4 * s.joints + shared_vectors * s.shared + s.parameters
 
 
 class ReplayedInputs(NamedTuple):
-    """Inputs of a recorded run of N arms, with which a simulation repeats the run.
+    """Inputs of a recorded run of N arms, used to repeat the run in a simulation.
 
-    Each arm receives the states of P other arms, its peers. A tick is one control period.
+    Each arm receives samples from P peers.
 
     Attributes:
-        first: Index into `samples` of the first arrival, by site, peer and tick. For K ticks
-            the shape is (N, P, K + 1). If K is 0, each sample arrives at the first tick after
-            it was sent.
-        samples: The ticks in which the peers sent the samples, in the order of arrival.
-        hands: Actions of the person or program that moves the arm, by site and tick. The shape
-            is (N, K, 1 + 2 m). The numbers are the firmness of the grip from 0 to 1, the m
-            coordinates of the target, and the target one second later. If K is 0, nobody holds
-            the arms.
-        hand_indices: For each site the index of this person or program among its operators and
-            environments, shape (N,). -1 if nobody moves the arm.
+        first: Index into `samples` of the first arrival, by site, peer and tick. The shape is
+            (N, P, K + 1) for K ticks. If K is 0, each sample arrives at the first tick after it
+            was sent.
+        samples: Ticks in which the peers sent the samples, in order of arrival.
+        hands: Actions of the person or program that moves each arm, by site and tick, shape (N,
+            K, 1 + 2 m). The columns are the grip firmness from 0 to 1, the m target
+            coordinates, and the target one second later. If K is 0, nobody holds the arms.
+        hand_indices: For each site, the index of this person or program among its torque
+            sources (operators and environments), or -1 if nobody moves the arm. Shape (N,).
     """
 
     first: IntArray
@@ -106,27 +101,26 @@ class ReplayedInputs(NamedTuple):
 def _accept_record(
     k: int, rate_hz: int, peer: SiteRow, sample: int, sent: RecentRecords, link: LinkArrays
 ) -> None:
-    """Lets a simulated arm receive the state (sample) of another arm, without a network.
+    """Delivers a sample from one simulated arm to another, without a network.
 
-    The sample is read from the record of the other arm, the peer. A record contains the results
-    of one tick, a period of the control loop. With n joints, m coordinates that the arms share
-    and P parameters, its floating-point numbers are
+    The sample is read from the peer's record. With n joints, m coordinates shared between arms
+    and P parameters, the floating-point values of a record are
 
         q (n), qd (n), q_des (m), qd_des (m), tau (n), tau_x (n), theta_hat (P),
         x (m), xd (m), wrench (m),                                  only in task space
-        the numbers that the control law of the peer sends
+        the values sent by the peer's control law
 
-    Arms that share joint angles send q, qd and tau_x. Arms in task space send the pose x, its
-    velocity xd and the external wrench on the end effector instead.
+    Arms that share joint angles send q, qd and tau_x. Arms in task space instead send the pose
+    x, its velocity xd and the external wrench on the end effector.
 
     Args:
-        k: Present tick of the receiver.
+        k: Current tick of the receiver.
         rate_hz: Tick rate of the receiver, Hz.
         peer: State of the peer.
         sample: Tick in which the peer sent the sample.
-        sent: Latest records of the peer, a ring buffer: the record of tick i is at i modulo the
-            length.
-        link: Arrays of the link from the peer; the sample is stored in them.
+        sent: Latest records of the peer, in a ring buffer: the record of tick i is at index i
+            modulo the length.
+        link: Arrays of the link from the peer, in which the sample is stored.
     """
     n = peer.joints
     m = peer.shared
@@ -135,7 +129,7 @@ def _accept_record(
     qd_column = n
     tau_x_column = 3 * n + 2 * m
     if peer.task:
-        # x, xd and the wrench are the last vectors before the numbers that the law sends.
+        # x, xd and the wrench are the last vectors before the values sent by the law.
         q_column = first_sent - 3 * m
         qd_column = first_sent - 2 * m
         tau_x_column = first_sent - m
@@ -166,25 +160,24 @@ def _accept_prompt_records(
     sent: RecentRecords,
     link: LinkArrays,
 ) -> int:
-    """Lets an arm receive all states that another arm (peer) sent before time t, without delay.
+    """Delivers all samples that a peer sent before time t, without network delay.
 
-    The states are in the records of the peer. A record contains the results of one tick, a
-    period of the control loop. A received state is stored until the simulated delay of the link
-    has passed.
+    The samples are read from the peer's records, and stored until the simulated delay of the
+    link has passed.
 
     Args:
-        k: The tick of the receiver.
-        t_ns: Time t of this tick, ns since the epoch, the common start of the session.
+        k: Current tick of the receiver.
+        t_ns: Time t of this tick, ns since the epoch (the common start of the session).
         rate_hz: Tick rate of the receiver, Hz.
         peer: State of the peer.
         records: Number of records that the peer has written.
         next_sample: Tick of the peer's first record that has not been accepted yet.
-        sent: The last records of the peer, in a ring buffer: record n is at n modulo its
+        sent: Latest records of the peer, in a ring buffer: record n is at index n modulo its
             length.
-        link: The link from the peer.
+        link: Arrays of the link from the peer.
 
     Returns:
-        The tick of the peer's first record that is still not accepted.
+        The tick of the peer's first record that remains to be accepted.
     """
     # The length of the ring is a power of two, so a modulo is a mask of the lower bits.
     ring_mask = sent.t_ns.shape[0] - 1
@@ -200,20 +193,21 @@ def _accept_prompt_records(
 def _apply_recorded_hand(
     i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
 ) -> None:
-    """Repeats the action of a person on an arm in one control period of a recorded run.
+    """Repeats a live operator's action on an arm in one control period of a recorded run.
 
-    A person or program that moves the arm during the run is called a live hand. It is simulated
-    by a spring, which pulls the arm to a target. The grip (a factor of the force), the target,
-    and the target one second later are written into the data of the live hand. Nothing happens
-    without a live hand, or after the end of the recorded run.
+    A live operator (hand) is simulated by a spring that pulls the arm to a target. The grip (a
+    factor of the force), the target, and the target one second later are written to the row of
+    the live hand. Nothing happens if there is no live hand, or after the end of the recorded
+    run.
 
     Args:
         i: Index of the site.
-        k: The tick, a period of the site's control loop.
+        k: Current tick.
         actors: Operators and environments of the site. The fields `a` and `b` of a live hand
             are its target and its target one second later, m or rad.
-        feed: Inputs of the recorded run. `feed.hands` contains for each site and tick the grip,
-            0 to 1, the coordinates of the target, and those of the target one second later.
+        feed: Inputs of the recorded run. For each site and tick, `feed.hands` contains the
+            grip, 0 to 1, the coordinates of the target, and those of the target one second
+            later.
     """
     index = feed.hand_indices[i]
     has_live_hand = index >= 0
@@ -239,25 +233,25 @@ def update_peaks(
     peaks: Array,
     sums: SumsRow,
 ) -> None:
-    """Updates the largest errors and speeds of an arm, and its sums of errors, for a record.
+    """Updates the peak errors and speeds of an arm, and its error sums, with a new record.
 
-    A simulation of many runs keeps these statistics instead of the records. The largest values
-    are kept for each interval of time (bucket).
+    A simulation of many runs keeps these statistics instead of the records. Peaks are kept per
+    time interval (bucket).
 
     Args:
-        row: Floating-point numbers of the record, the results of one control period.
-        t_ns: Nominal time of the period, ns since the start of the session.
+        row: Floating-point values of the record.
+        t_ns: Nominal time of the control period, ns since the start of the session.
         settled_rad: Position error below which the arm counts as settled, rad.
-        s: State of the site (the process that runs the arm).
-        progress: Progress of the site. The time of the last larger error is updated.
-        peaks: Largest values in the present interval, see `run_until`, shape (3 n,).
+        s: State of the site.
+        progress: Progress of the site, in which the time of the last larger error is updated.
+        peaks: Peaks of the current interval, see `run_until`, shape (3 n,).
         sums: Sums over all records of the site.
     """
     largest_error = 0.0
     joints = peaks.shape[0] // 3
     pose = first_sent_column(s) - 3 * s.shared if s.task else 0
     reference = 2 * s.joints
-    # A task may have fewer coordinates than the arm has joints, or more: the rest are zeros.
+    # A task may have fewer or more coordinates than the arm has joints. The rest are zeros.
     for i in range(joints):
         e = 0.0
         speed = 0.0
@@ -282,14 +276,14 @@ def update_peaks(
 
 @leaf
 def _advance_bucket(progress: ProgressRow) -> None:
-    """Advances to the next interval of time (bucket) for which largest values are kept.
+    """Advances to the next time interval (bucket) for which the largest values are kept.
 
-    This happens once an arm has completed all control periods of the present interval. Periods
-    are counted in fractions of the interval, because an interval need not be a multiple of a
+    Called when an arm has completed all control periods of the current interval. Periods are
+    counted in fractions of the interval, because an interval need not be a multiple of a
     period.
 
     Args:
-        progress: Progress of the site (the process that runs the arm); changed.
+        progress: Progress of the site; updated in place.
     """
     progress.part += BUCKETS_PER_S
     while progress.part >= progress.rate_hz:
@@ -299,13 +293,13 @@ def _advance_bucket(progress: ProgressRow) -> None:
 
 @leaf
 def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
-    """Computes the gravity torque of an arm at the pose in one of its records.
+    """Computes the gravity torque of an arm in the pose of a given record.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        row: Floating-point numbers of the record. They begin with the joint angles.
-        torque: Receives the torque, shape (n,), N m.
+        row: Floating-point values of the record, which start with the joint angles.
+        torque: Output array for the torque, shape (n,), N m.
     """
     if chain is None:
         two_link_stages.put_gravity_torque(s, torque)
@@ -324,20 +318,18 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments for the motion in an arm's record.
-
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    """Computes the torque of operators and environments for the motion in a given record.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        row: Floating-point numbers of the record. They begin with joint angles and velocities.
-        actors: Operators and environments, one row for each.
+        row: Floating-point values of the record, which start with joint angles and velocities.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
-        sampled: 1 for those with a torque that is constant during a control period, 0 for all
-            others.
-        torque: Receives the torque, shape (n,), N m.
+        sampled: 1 to select those whose torque is constant during a control period, 0 to select
+            all others.
+        torque: Output array for the torque, shape (n,), N m.
     """
     if chain is None:
         two_link_stages.put_source_torque(
@@ -370,18 +362,19 @@ def update_sums(
     """Adds a control period to the sums of an arm's motor effort and its environments' work.
 
     The effort is the sum of the squared torques beyond gravity. The work in a control period is
-    the torque times the change of the joint angles q. The torque that varies during the period
-    is taken as the mean of both ends (trapezoid rule), and the constant torque is added.
+    the torque times the change in the joint angles q. For a torque that varies during the
+    period, the mean of its values at both ends is used (trapezoidal rule). The constant torque
+    is added.
 
     Args:
-        k: Number of the tick (control period).
+        k: Tick to add.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        environments: Environments that the arm may touch, without its operators.
+        environments: Environments that the arm may touch, excluding its operators.
         table: Tables of all operators and environments, for example of recorded torques.
-        row: Floating-point numbers of the record, the results of the tick.
-        sums: Sums over all records of the site; changed.
+        row: Floating-point values of the record of this tick.
+        sums: Sums over all records of the site; updated in place.
     """
     n = s.joints
     t_s = t_ns * 1e-9
@@ -432,16 +425,13 @@ def update_sums(
 
 
 class LawArrays(NamedTuple):
-    """Arrays with which the compiled simulation calls users' control laws, for all N arms.
-
-    They contain the addresses of the compiled laws, and the numbers that the laws keep and
-    send.
+    """Arrays through which the compiled simulation of N arms calls users' control laws.
 
     Attributes:
         addresses: Address of the machine code of each site's law, shape (N,), see
-            `CompiledLaw`. 0 if the law of the site is built in.
-        rows: Gains and memory of each law, one row per site, filled up to equal length.
-        sent: Numbers that each law sends to other sites, one row per site, filled up to equal
+            `CompiledLaw`. 0 if the site uses a built-in law.
+        rows: Gains and memory of each law, one row per site, padded to equal length.
+        sent: Values that each law sends to other sites, one row per site, padded to equal
             length.
     """
 
@@ -458,25 +448,25 @@ def _compute_torque(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Computes the torque of an arm's control law in the present control period (tick).
+    """Computes the torque of an arm's control law in the current tick.
 
-    A law is built in, or a user wrote it. `torque_stage` computes the torque of built-in laws,
-    and does nothing for users' laws. `law_stage` calls a user's law that was compiled. A user's
-    law in plain Python has been called by the driver of the simulation before.
+    `torque_stage` computes the torque of built-in laws, and does nothing for user-written laws.
+    A compiled user law is called by `law_stage`. A user law in plain Python has already been
+    called by the driver of the simulation.
 
     Args:
-        i: Index of the site, the process that runs one arm.
-        progress: Progress of the site, with the tick and its nominal time.
+        i: Index of the site.
+        progress: Progress of the site, including the tick and its nominal time.
         arrays: Arrays of all sites.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        laws: The users' compiled laws. None if no site has such a law. The address of a law is
-            0 for a site that has no compiled law.
+        laws: Compiled user laws, or None if no site has one. The address is 0 for a site
+            without a compiled law.
     """
     if laws is None:
         torque_stage(arrays.site[i], chain)
         return
-    # The channel contains the numbers that other sites' laws send to this law. A site with a
-    # compiled law has such a channel.
+    # The channel contains the values that other sites' laws send to this law. A site with a
+    # compiled law always has a channel.
     channel = channel_of(arrays.channel, i)
     is_compiled = laws.addresses[i] != 0
     if not is_compiled or channel is None:
@@ -497,15 +487,15 @@ def _compute_torque(
 
 @leaf
 def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
-    """Writes the numbers that a control law sends to other arms into the record of its arm.
+    """Writes the values that a control law sends to other arms to the record of its arm.
 
-    The other arms of the simulation read the values from this record.
+    The other arms in the simulation read the values from this record.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         i: Index of the site.
-        row: Floating-point numbers of the record; changed.
-        laws: Compiled control laws that users wrote. None if there are no such laws.
+        row: Floating-point values of the record; updated in place.
+        laws: Compiled user-written control laws, or None if there are none.
     """
     if laws is not None:
         first = first_sent_column(s)
@@ -523,11 +513,11 @@ def sense_site(
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Computes the part of an arm's next control period that comes before its control law.
+    """Computes the part of an arm's next control period that precedes its control law.
 
-    This part accepts the messages (states) of the other arms, and computes the reference, which
-    is the position to follow, the errors and the parameter estimate. The messages arrive as in
-    a recorded run, or without delay if no run is repeated.
+    Accepts the messages of the other arms, then computes the reference, the errors and the
+    parameter estimate. Messages arrive as they did in the recorded run, or without delay if no
+    run is being repeated.
 
     Args:
         i: Index of the site.
@@ -605,21 +595,21 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Completes a control period of one arm, after `sense_site` has computed its first part.
+    """Completes the control period of one arm that `sense_site` has started.
 
-    The control law computes the torque, and the arm moves to the next period. The results of
-    the period are added to statistics of the run.
+    The control law computes the torque, the arm moves on to the next period, and the results
+    are added to the statistics of the run.
 
     Args:
-        i: Index of the site, the process that runs one arm.
+        i: Index of the site.
         settled_rad: Position error below which the arm counts as settled, rad.
         progress: State of the simulation, one row per site, see `ProgressRow`.
-        sent: Latest records of the sites; the new record is written.
-        peaks: Largest errors and speeds so far, see `run_until`; updated.
-        sums: Sums over the records, see `SumsRow`; updated.
-        arrays: Arrays of all sites; updated.
+        sent: Latest records of the sites; the new record is written here.
+        peaks: Largest errors and speeds so far, see `run_until`; updated in place.
+        sums: Sums over the records, see `SumsRow`; updated in place.
+        arrays: Arrays of all sites; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        laws: Compiled control laws that users wrote. None if there are no such laws.
+        laws: Compiled user-written control laws, or None if there are none.
 
     Returns:
         The mode of the site, a member of `Mode`.
@@ -689,28 +679,28 @@ def run_until(
     chains: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Simulates all arms of an experiment up to a time, or until an arm diverges.
+    """Simulates all arms of an experiment until a given time, or until an arm diverges.
 
-    The control periods of all arms are computed in the order of their times, because each arm
+    The control periods of all arms are interleaved in chronological order, because each arm
     receives the states of the others.
 
     Args:
         last_ns: Time of the last control period to compute, ns since the start of the session.
         settled_rad: Position error below which an arm counts as settled, rad. The progress of a
-            site contains the last time of a larger error.
+            site stores when this error was last exceeded.
         progress: Progress of the sites, shape (N,), PROGRESS_DTYPE.
-        next_samples: Number of the next sample (state of another arm) to accept, for each of N
-            sites and P peers (the other sites), shape (N, P).
+        next_samples: Number of the next sample to accept, for each of N sites and P peers,
+            shape (N, P).
         sent: Latest records of the sites, from which the samples are taken.
-        feed: Inputs of a recorded run that is repeated.
-        peaks: For each interval of time (bucket) the largest position error |e| of each joint,
-            then the largest speed |qd| of each joint, then the last angle q of each joint; -1
-            if there is no record. The shape is (N, buckets, 3 n).
+        feed: Inputs of the recorded run to repeat.
+        peaks: For each time interval (bucket), the largest position error |e| of each joint,
+            then the largest speed |qd| of each joint, then the last angle q of each joint, or
+            -1 if the interval contains no record. Shape (N, buckets, 3 n).
         sums: Sums over the records of the sites, shape (N,), see `sums_dtype`.
         arrays: Arrays of all sites, see `SiteArrays.stack`.
-        chains: The field `chain` of `arrays` once more. If this argument is None, Numba does
-            not compile the functions for chains of joints.
-        laws: Compiled control laws that users wrote. None if there are no such laws.
+        chains: The same array as the field `chain` of `arrays`. If None, Numba does not compile
+            the functions for chains of joints.
+        laws: Compiled user-written control laws, or None if there are none.
     """
     count = progress.shape[0]
     while True:

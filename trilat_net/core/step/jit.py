@@ -1,22 +1,22 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
-"""Compiles numerical functions with Numba, and stores their machine code on disk.
+"""Compiles numerical functions with Numba, and caches their machine code on disk.
 
-A function with the decorator `leaf` is compiled at its first call. Compiling the whole core
-takes long, so later processes load the stored code. Numba has such a cache too, but it does not
-notice a change of a function that the stored function calls.
+A function decorated with `leaf` is compiled on its first call. Compiling the whole core is
+slow, so later processes load the cached code instead. Numba's own cache is not used, because it
+does not notice when a function called by a cached function changes.
 
-- The code is stored in the user's cache directory, in a folder named after a hash of all source
-  files of this package and of `records.py`, whose constants it contains.
-- A binary wheel contains the same kind of folder, with code for any processor of its platform.
-  This code is used if the cache directory has no code for the present processor.
-- A function that is called by another compiled function only, an inner leaf, is stored as LLVM
-  code before optimisation, because it is optimised together with its caller. All others are
-  stored as machine code alone, which halves the files and shortens the start of a command.
+- The code is stored in a folder of the user's cache directory. The folder is named after a hash
+  of all source files of this package, and of `records.py`, whose constants are compiled in.
+- Binary wheels ship the same kind of folder, with code that runs on any processor of their
+  platform. It is used if the cache directory has no code for the current processor.
+- An inner leaf, which is only called by other compiled functions, is stored as unoptimised LLVM
+  code, since it is optimised together with its caller. All other functions are stored as
+  machine code only, which halves the size of the files and speeds up the start of a command.
 
 Invariant:
-    - Floating-point operations are not reordered (no fastmath). Therefore compiled functions
-      and plain Python give the same bits.
-    - The compilation and the caches of other code in the process are not affected.
+    - Floating-point operations are not reordered (no fastmath), so compiled functions and plain
+      Python produce identical bits.
+    - Compilation and caching of other Numba code in the process are not affected.
 """
 
 import hashlib
@@ -62,16 +62,16 @@ with suppress(OSError, IndexError):  # only Linux has the file
 
 
 _CORE = Path(__file__).parents[1]
-"""Folder of the core, to which this package belongs."""
+"""Folder of the core, which contains this package."""
 _CORE_PACKAGE = __package__.rpartition(".")[0]
-"""Name of the package of the core."""
+"""Name of the core package."""
 
 
 def _cache_root() -> Path:
-    """Returns the directory in which programs of this user may keep files for faster starts.
+    """Returns the user's cache directory, in which programs may keep files for faster starts.
 
-    It is ~/.cache on Linux, unless XDG_CACHE_HOME names another directory, and the
-    corresponding directory on other platforms.
+    This is ~/.cache on Linux, unless XDG_CACHE_HOME names another directory, and the equivalent
+    directory on other platforms.
     """
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
@@ -83,8 +83,8 @@ def _cache_root() -> Path:
 def _core_digest() -> str:
     """Returns a hash that shows whether machine code on disk was compiled from these sources.
 
-    It covers Numba's version, the files of the core, and `records`, whose constants the core
-    contains.
+    It covers Numba's version, the files of the core, and `records`, whose constants are
+    compiled into the core.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     for source in (*sorted(_CORE.rglob("*.py")), _CORE.with_name("records.py")):
@@ -93,10 +93,10 @@ def _core_digest() -> str:
 
 
 def _writable_cache() -> Path | None:
-    """Returns the directory in which compiled functions are stored, and creates it if needed.
+    """Returns the directory in which compiled functions are stored, creating it if necessary.
 
-    The result is None if the directory is not writable. Compiled functions are then kept in
-    memory only.
+    Returns None if the directory is not writable. Compiled functions are then kept in memory
+    only.
     """
     try:
         directory = _cache_root() / "trilat-net" / _core_digest()
@@ -113,11 +113,11 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if a simulation can start at once, because its code was compiled earlier.
+    """Returns True if a simulation can start immediately, without compiling the core first.
 
-    Otherwise the first run takes longer, and a command can say so beforehand. Only the function
-    `kernel.site_tick` is looked for on disk. It is compiled last, so the other functions are
-    there too.
+    Commands use this to announce that the first run will take longer. Only the function
+    `kernel.site_tick` is looked up on disk: it is compiled last, so if it is there, the others
+    are too.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -136,14 +136,14 @@ COMPILING = (
 
 
 class _CompilingNotice(event.Listener):
-    """Reports once that the core is compiled, which makes a first run take longer.
+    """Prints a one-time notice that the core is being compiled, which delays a first run.
 
-    Numba calls this object at the start and the end of each compilation. During a compilation,
-    signals such as Ctrl-C end the process at once.
+    Numba calls this object at the start and end of each compilation. During a compilation,
+    signals such as Ctrl-C end the process immediately.
 
     Attributes:
-        is_reported: True if the notice was reported, or must not be reported.
-        report: Writes the notice; by default to standard error.
+        is_reported: True if the notice has been printed, or must not be.
+        report: Function that prints the notice, by default to standard error.
     """
 
     def __init__(self) -> None:
@@ -153,10 +153,10 @@ class _CompilingNotice(event.Listener):
         self._restorers: list[Callable[[], None]] = []
 
     def on_start(self, event_data: Any) -> None:
-        """Reports the first compilation of a function of the core, because it takes long.
+        """Prints a notice before the first compilation of a core function, which is slow.
 
-        Numba calls this method at the start of each compilation. Until the end of the
-        compilation, signals such as Ctrl-C end the process at once.
+        Numba calls this method at the start of each compilation. While the compilation is
+        running, signals such as Ctrl-C end the process immediately.
 
         Args:
             event_data: Numba's description of the compilation.
@@ -171,7 +171,7 @@ class _CompilingNotice(event.Listener):
             self.report(COMPILING)
 
     def on_end(self, _: Any) -> None:
-        """Restores the handlers of signals when Numba reports the end of a compilation."""
+        """Restores the signal handlers when Numba reports the end of a compilation."""
         restore = self._restorers.pop()
         restore()
 
@@ -182,12 +182,12 @@ _register("numba:compile", compiling_notice)
 
 
 def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
-    """Returns a unique name for a record type, for the symbols of compiled functions.
+    """Returns a unique name for a record type, used in the symbols of compiled functions.
 
     A record type describes the rows of a structured array. Numba itself numbers these types in
-    the order in which a process uses them. Two processes could then compile functions for
+    the order in which a process uses them. Two processes could therefore compile functions for
     different types under the same symbol, and a third process that loads both from the cache
-    would mix them up. The name here is a hash of the type's fields.
+    would mix them up. To prevent this, the name returned here is a hash of the type's fields.
     """
     digest = hashlib.sha256(record.name.encode()).hexdigest()
     return "Record", (f"r{digest[:16]}",)
@@ -197,8 +197,10 @@ _record: Any = types.Record
 _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
-"""Options of leaves: no leaf allocates an array, so Numba need not count references, which
-would cost more than the arithmetic.
+"""Numba options of leaves.
+
+Reference counting would cost more than the arithmetic, and is not needed because leaves
+allocate no arrays.
 """
 _LEAF_OPTIONS: Any = {
     "nopython": True,
@@ -209,17 +211,17 @@ _LEAF_OPTIONS: Any = {
     **_OPTIONS,
 }
 _INNER = "within"
-"""Marks stored code as the code of an inner leaf."""
+"""Marks stored code as that of an inner leaf."""
 _NO_LLVM_CODE = parse_assembly("").as_bitcode()
 """An empty LLVM module."""
 
 
 @cache
 def _hash_folder(folder: Path) -> str:
-    """Returns a hash of all Python files of a folder, to detect outdated machine code.
+    """Returns a hash of all Python files in a folder, to detect outdated machine code.
 
-    It is used for functions outside the core. If a file changes, so does the hash, and machine
-    code that was stored with the old hash is no longer used.
+    Used for functions outside the core. If a file changes, the hash changes, and machine code
+    stored under the old hash is no longer used.
     """
     digest = hashlib.sha256()
     for source in sorted(folder.glob("*.py")):
@@ -230,9 +232,9 @@ def _hash_folder(folder: Path) -> str:
 class _LeafLocator:
     """Tells Numba where the machine code of a function is stored, and when it is out of date.
 
-    By default, Numba compares the time of the function's file. With this class, it compares a
-    hash of all files in the folder of the function, because the function may call functions of
-    these files.
+    By default, Numba checks the modification time of the function's file. This class compares a
+    hash of all files in the folder of the function instead, because the function may call
+    functions in these files.
     """
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
@@ -246,7 +248,7 @@ class _LeafLocator:
         return str(root / self._py_file.parent.name)
 
     def get_source_stamp(self) -> str:
-        # Some leaves are outside of the core, whose hash names the directory.
+        # The directory is named after a hash of the core, but some leaves are outside the core.
         return _hash_folder(self._py_file.parent)
 
     def get_disambiguator(self) -> str:
@@ -259,8 +261,8 @@ class _LeafLocator:
 class _LeafCacheImpl(CompileResultCacheImpl):
     """Converts compiled functions to the content of cache files, and back.
 
-    A function that only other compiled functions call (an inner leaf) is stored as LLVM code.
-    All others are stored as machine code.
+    A function that is only called by other compiled functions (an inner leaf) is stored as LLVM
+    code, all others as machine code.
     """
 
     _locator_classes = cast(Any, [_LeafLocator])
@@ -268,16 +270,15 @@ class _LeafCacheImpl(CompileResultCacheImpl):
     def rebuild(self, context: Any, content: Any) -> Any:
         """Converts the content of a cache file to a compiled function.
 
-        A leaf is a function with the decorator `leaf`. Numba itself loads the machine code of a
-        leaf. For the LLVM code of an inner leaf, which only other leaves call, this method
-        creates the objects that Numba has after a compilation. It uses private names of Numba,
-        because Numba has no interface for this.
+        For the machine code of a leaf, this is left to Numba. For the LLVM code of an inner
+        leaf, this method creates the objects that Numba would have after a compilation. Numba
+        has no public interface for this, so private names are used.
 
         Args:
             context: Numba's description of the target processor.
-            content: Content of the file, as `CompileResult._reduce` wrote it. The first entry
-                is what `_LeafLibrary.serialize_using_object_code` returned, and the others are
-                arguments of `compile_result` in a fixed order.
+            content: Content of the file, as written by `CompileResult._reduce`. The first entry
+                was returned by `_LeafLibrary.serialize_using_object_code`; the others are the
+                positional arguments of `compile_result`.
 
         Returns:
             Numba's description of the compiled function.
@@ -285,7 +286,7 @@ class _LeafCacheImpl(CompileResultCacheImpl):
         name, kind, code = content[0]
         is_inner = kind == _INNER
         if not is_inner:
-            # Numba would take the names of the functions from the LLVM code.
+            # Numba would read the function names from the LLVM code.
             function = content[1]
             symbols = {function.llvm_func_name, function.llvm_cpython_wrapper_name}
             context.codegen()._engine._defined_symbols.update(symbols)
@@ -293,10 +294,10 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 
         library = _LeafLibrary(context.codegen(), name)
         library.is_inner = True
-        # No machine code is needed, so the library counts as complete with its LLVM code.
+        # No machine code is needed, so the library is complete once it has LLVM code.
         library._finalized = True
         library._final_module = parse_bitcode(code)
-        # The order of `CompileResult._reduce`.
+        # In the order used by `CompileResult._reduce`.
         names = (
             "fndesc",
             "environment",
@@ -318,22 +319,22 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 
 
 class _CompressedFiles(IndexDataCacheFile):
-    """The cache files of one compiled function, compressed to a quarter of their size.
+    """Cache files of one compiled function, compressed to a quarter of their size.
 
-    Numba numbers the files. Therefore two processes may write different code into one file. In
-    this class, the name of a file contains a hash of its key instead.
+    Numba would number the files, so two processes could write different code to the same file.
+    In this class, the name of a file contains a hash of its key instead.
     """
 
     def save(self, key: Any, code: Any) -> None:
-        """Writes compiled code to a file, and adds the file to the index of the cache.
+        """Writes compiled code to a file, and adds the file to the cache index.
 
-        The index contains the name of the file for each key. Numba numbers the files. Two
-        processes that compile at the same time may then choose the same number. A hash of the
-        key instead of a number makes the names differ.
+        The index maps each key to a file name. Numba would number the files, so two processes
+        that compile at the same time could pick the same number. The names used here contain a
+        hash of the key instead.
 
         Args:
-            key: Types of the arguments and the processor, for which the code was compiled.
-            code: The compiled code, as Numba serialises it.
+            key: Argument types and processor for which the code was compiled.
+            code: The compiled code, as serialised by Numba.
         """
         names = self._load_index()
         # Numba's name for file 0 is "FUNCTION.0.SUFFIX": the hash replaces the number.
@@ -358,8 +359,8 @@ class _CompressedFiles(IndexDataCacheFile):
 class _LeafCache(FunctionCache):
     """Stores the machine code of one compiled function on disk, and loads it.
 
-    Code is read from the user's cache directory, or else from the installed wheel. New code is
-    written into the user's cache directory.
+    Code is read from the user's cache directory, or failing that, from the installed wheel. New
+    code is written to the user's cache directory.
     """
 
     _impl_class = _LeafCacheImpl
@@ -376,18 +377,18 @@ class _LeafCache(FunctionCache):
         self._inner = files(str(folder), f"{base}-within", stamp)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Loads the machine code of the function for given types of arguments.
+        """Loads the machine code of the function for given argument types.
 
-        The user's cache directory is searched first. The code in the installed wheel comes
-        second. In contrast to the method of Numba, this method does not prepare the compiler,
-        which would take far longer than loading.
+        The user's cache directory is searched first, then the code in the installed wheel.
+        Unlike Numba's own method, this one does not initialise the compiler, which would take
+        far longer than loading.
 
         Args:
             signature: Types of the arguments.
             context: Numba's description of the target processor.
 
         Returns:
-            Numba's description of the compiled function. None if there is no stored code.
+            Numba's description of the compiled function, or None if there is no stored code.
         """
         with self._guard_against_spurious_io_errors():
             result = self._load_overload(signature, context)
@@ -407,14 +408,15 @@ class _LeafCache(FunctionCache):
     def load_inner(self, argument_types: Any, context: Any) -> Any:
         """Loads the LLVM code of a function that another compiled function calls.
 
-        LLVM code is the intermediate form from which the compiler makes machine code.
+        LLVM code is the intermediate representation from which the compiler generates machine
+        code.
 
         Args:
-            argument_types: Numba's types of the arguments.
+            argument_types: Numba types of the arguments.
             context: Numba's description of the target processor.
 
         Returns:
-            Numba's description of the compiled function. None if the cache has no code for
+            Numba's description of the compiled function, or None if the cache has no code for
             these types.
         """
         key = self._index_key(argument_types, context.codegen())
@@ -424,11 +426,11 @@ class _LeafCache(FunctionCache):
     def save_inner(self, argument_types: Any, result: Any) -> None:
         """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
 
-        The code is kept in its own files, separate from the machine code that Python calls.
-        Nothing is stored if there is no cache directory in which files can be written.
+        The files are kept separate from the machine code that is called from Python. Nothing is
+        stored if no cache directory is writable.
 
         Args:
-            argument_types: Numba's types of the arguments.
+            argument_types: Numba types of the arguments.
             result: Numba's description of the compiled function.
         """
         has_cache = _CACHE is not None
@@ -441,11 +443,11 @@ class _LeafCache(FunctionCache):
 
 
 class _LeafLibrary(JITCodeLibrary):
-    """Code of one compiled function, as LLVM code or as machine code.
+    """Code of one compiled function, either as LLVM code or as machine code.
 
-    A function that only other compiled functions call (an inner leaf) is optimised once, as a
-    part of its caller. Numba would also optimise it alone, and add a wrapper for calls from
-    Python. This class skips both steps, which halves the time of compilation.
+    A function that is only called by other compiled functions (an inner leaf) is optimised only
+    once, as part of its caller. Numba would also optimise it separately, and add a wrapper for
+    calls from Python. Skipping both steps halves the compilation time.
     """
 
     is_inner = False
@@ -471,9 +473,9 @@ class _LeafLibrary(JITCodeLibrary):
 
 
 def _as_inner(result: Any) -> Any:
-    """Makes a function that exists only as LLVM code known to its compiled callers.
+    """Makes a function that exists only as LLVM code available to compiled callers.
 
-    Numba finds a called function by its entry point, the Python object of its machine code.
+    Numba looks up a called function by its entry point, the Python object of its machine code.
     LLVM code has no entry point, so a new object takes its place.
     """
     result = result._replace(entry_point=object())
@@ -483,14 +485,14 @@ def _as_inner(result: Any) -> Any:
 
 
 class _LeafCompiler(Compiler):
-    """Compiles a numerical function with Numba, for calls from Python or from compiled code.
+    """Compiles a numerical function (leaf) with Numba, for calls from Python or compiled code.
 
-    The functions are called leaves. A leaf that is compiled because another leaf calls it is an
-    inner leaf, and becomes a part of its caller.
+    A leaf that is compiled because another leaf calls it is an inner leaf, and becomes part of
+    its caller.
 
     Attributes:
-        depth: Number of nested callers whose compilation is in progress and needs leaves.
-        library_class: Class of the code of a leaf that is not an inner leaf.
+        depth: Number of nested callers that are currently being compiled and need leaves.
+        library_class: Code class of a leaf that is not an inner leaf.
         has_distinct_arguments: True if the arguments of a leaf that is not an inner leaf never
             overlap in memory.
     """
@@ -502,10 +504,9 @@ class _LeafCompiler(Compiler):
     def compile_extra(self, function: Any) -> Any:
         """Compiles a leaf to machine code that Python can call, or to LLVM code.
 
-        A leaf is a function with the decorator `leaf`. While the compilation of another leaf is
-        in progress, this leaf is compiled because the other leaf calls it. It is then an inner
-        leaf. Only LLVM code is produced, which becomes a part of the other leaf. Numba calls
-        this method.
+        If this happens while another leaf is being compiled, the other leaf must be the caller.
+        The function is then an inner leaf, and only LLVM code is produced, which becomes part
+        of the caller. Called by Numba.
 
         Args:
             function: The Python function.
@@ -521,7 +522,7 @@ class _LeafCompiler(Compiler):
         state.library.is_inner = is_inner
         state.flags.noalias = self.has_distinct_arguments and not is_inner
         if is_inner:
-            # No machine code, and no wrappers by which Python or C could call it.
+            # Generates neither machine code nor wrappers for calls from Python or C.
             state.flags.no_compile = True
             state.flags.no_cpython_wrapper = True
             state.flags.no_cfunc_wrapper = True
@@ -542,7 +543,7 @@ class _LeafCompiler(Compiler):
 
 @contextmanager
 def _compiling_caller() -> Iterator[None]:
-    """Treats each leaf that Numba compiles or looks up within the context as an inner leaf."""
+    """Treats each leaf that Numba compiles or looks up inside the context as an inner leaf."""
     _LeafCompiler.depth += 1
     try:
         yield
@@ -551,12 +552,13 @@ def _compiling_caller() -> Iterator[None]:
 
 
 def _prefer_wide_vectors(llvm_code: str) -> str:
-    """Asks LLVM to use vector instructions of 512 bits in the loops of a module.
+    """Makes LLVM use 512-bit vector instructions in the loops of a module.
 
-    By default LLVM chooses 256 bits even if a processor has longer registers, because some
-    processors lower their clock rate for these. The arithmetic of this program gains more from
+    By default, LLVM uses 256 bits even on processors with longer registers, because some
+    processors lower their clock rate for these. In this program, the arithmetic gains more from
     the longer registers than it loses. Processors without such registers are not affected. The
-    text is changed, because llvmlite cannot set an attribute that has a value.
+    source text of the module is edited, because llvmlite cannot set an attribute that has a
+    value.
 
     Args:
         llvm_code: The module as text.
@@ -573,8 +575,8 @@ def _prefer_wide_vectors(llvm_code: str) -> str:
 class _LaneLibrary(_LeafLibrary):
     """Machine code of a function with a long loop, with all functions that it calls inlined.
 
-    The compiler turns a loop into SIMD instructions only if the loop contains no calls. Such a
-    loop computes many control periods, or several simulations side by side (lanes).
+    The compiler only vectorises loops that contain no calls. Such a loop computes many control
+    periods, or several simulations side by side (lanes).
     """
 
     def _optimize_final_module(self) -> None:
@@ -587,20 +589,20 @@ class _LaneLibrary(_LeafLibrary):
 
 
 class _LoopCompiler(_LeafCompiler):
-    """Compiles a function with a long loop together with all functions that it calls.
+    """Compiles a function with a long loop, inlining all functions that it calls.
 
-    Calls within the loop would take much of its time. The technique is called inlining.
+    Calls inside the loop would otherwise take up much of its run time.
     """
 
     library_class = _LaneLibrary
 
 
 class _LaneCompiler(_LeafCompiler):
-    """Compiles a function that computes several simulations side by side, with SIMD.
+    """Compiles a function that computes several simulations side by side, using SIMD.
 
-    SIMD instructions process vectors. Each simulation has a lane, a position in the vectors.
-    The compiler may assume that the arguments do not overlap in memory. Without this
-    assumption, it would not use vector instructions.
+    Each simulation has a lane, which is a position in the vector registers. The compiler may
+    assume that the arguments do not overlap in memory; otherwise, it would not use vector
+    instructions.
     """
 
     library_class = _LaneLibrary
@@ -608,12 +610,10 @@ class _LaneCompiler(_LeafCompiler):
 
 
 def _is_in_lanes(numba_type: Any) -> bool:
-    """Returns True if a value has numbers of several simulations side by side (lanes).
-
-    A lane is one position in the vector registers of the processor (SIMD).
+    """Returns True if a value holds data of several simulations side by side (lanes).
 
     Args:
-        numba_type: Numba's type of the value. A type of rows in lanes has the attribute
+        numba_type: Numba type of the value. Types of rows in lanes have the attribute
             `in_lanes`.
     """
     if isinstance(numba_type, types.Array):
@@ -625,14 +625,14 @@ def _is_in_lanes(numba_type: Any) -> bool:
 
 
 class _Leaf(CPUDispatcher):
-    """Replaces a numerical function (leaf) in all calls, and compiles it when it is called.
+    """Stands in for a numerical function (leaf), and compiles it when it is called.
 
-    The function is compiled for the types of its arguments (as Numba's dispatchers do). If it
-    was compiled as a part of another leaf, it is compiled again for calls from Python.
+    Like Numba's dispatchers, it compiles the function for the types of its arguments. A
+    function that was compiled as part of another leaf is compiled again for calls from Python.
 
     Attributes:
         choose_lane_form: Returns the implementation of the leaf for rows in lanes, see
-            `set_lane_form`. None if the implementation is the leaf itself.
+            `set_lane_form`. None if the leaf itself is the implementation.
     """
 
     _cache: Any
@@ -644,43 +644,42 @@ class _Leaf(CPUDispatcher):
         self._compiler._get_implementation = self._choose_implementation
 
     def _choose_implementation(self, arguments: tuple[Any, ...], _keywords: Any) -> Any:
-        """Returns the Python function to compile for given types of arguments.
+        """Returns the Python function to compile for given argument types.
 
         This is the function (leaf) itself, unless the arguments belong to several simulations
-        side by side (lanes) and the function has another implementation for these, see
-        `set_lane_form`. Numba calls this method.
+        side by side (lanes) and a different implementation was registered for these, see
+        `set_lane_form`. Called by Numba.
         """
         if self.choose_lane_form is not None and any(map(_is_in_lanes, arguments)):
             return self.choose_lane_form(arguments)
         return self.py_func
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Returns Numba's typing information for a call with given types of arguments.
+        """Returns Numba's typing information for a call with given argument types.
 
-        A constant argument is treated like any other value of its type. Otherwise Numba would
-        compile the function again for each constant. Numba calls this method.
+        Constant arguments are treated like any other value of their type, because Numba would
+        otherwise recompile the function for each constant. Called by Numba.
 
         Args:
             arguments: Types of the positional arguments.
-            keywords: Types of the keyword arguments, by name.
+            keywords: Types of the keyword arguments, keyed by name.
         """
         plain_arguments = tuple(map(types.unliteral, arguments))
         plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
-        # The caller may be a plain function of Numba, such as a user's law. It also gets an
+        # The caller may be a plain Numba function, such as a user's law. It is also given an
         # inner leaf, because a reference to machine code would be missing when the caller is
         # loaded again.
         with _compiling_caller():
             return super().get_call_template(plain_arguments, plain_keywords)
 
     def add_overload(self, result: Any) -> None:
-        """Stores a compiled form of the function, so that it need not be compiled again.
+        """Registers a compiled form of the function for later calls with the same types.
 
-        There are two forms. A leaf that Python calls is machine code. An inner leaf, which was
-        compiled because another leaf calls it, is LLVM code, which cannot be executed. Both are
-        entered into `overloads`, the table in which compiled callers look up a function by the
-        types of its arguments. Numba's own method also enters the machine code into the table
-        of functions that Python can call, where an inner leaf must not appear. Numba calls this
-        method.
+        A leaf called from Python is compiled to machine code. An inner leaf, compiled because
+        another leaf calls it, is LLVM code that cannot be executed. Both are added to
+        `overloads`, where compiled callers look up a function by its argument types. Numba's
+        own method would also add it to the table of functions callable from Python, where an
+        inner leaf must not appear. Called by Numba.
 
         Args:
             result: Numba's description of the compiled form.
@@ -694,19 +693,17 @@ class _Leaf(CPUDispatcher):
         self.overloads[argument_types] = result
 
     def compile(self, signature: Any) -> Any:
-        """Loads or compiles the function for given types of arguments.
+        """Loads or compiles the function for given argument types.
 
-        If Python calls the function, machine code is produced. If another function that is
-        being compiled calls it, LLVM code is produced, which is then optimised together with
-        its caller. `overloads` contains the compiled forms of the function, machine code or
-        LLVM code, by the types of the arguments.
+        A call from Python needs machine code. A call from another function that is being
+        compiled needs LLVM code, which is then optimised together with its caller. Both forms
+        are stored in `overloads`, keyed by the argument types.
 
         Args:
-            signature: Types of the arguments, in a form that Numba accepts.
+            signature: Argument types, in any form that Numba accepts.
 
         Returns:
-            The compiled function. For LLVM code, an object that stands for it in Numba's
-            tables.
+            The compiled function. For LLVM code, a placeholder for it in Numba's tables.
         """
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
@@ -725,10 +722,10 @@ class _Leaf(CPUDispatcher):
             return compiled.entry_point
 
     def _load_or_compile_inner(self, argument_types: Any, return_type: Any) -> Any:
-        """Returns the function as LLVM code, which becomes a part of a compiled caller.
+        """Returns the function as LLVM code that becomes part of a compiled caller.
 
-        The code is loaded from the cache on disk if the cache contains it. Otherwise the
-        function is compiled, and its code is stored.
+        The code is loaded from the disk cache if possible. Otherwise, the function is compiled
+        and its code is stored.
         """
         # The code of a leaf for several runs side by side (lanes) is not stored. It contains
         # the functions that `set_lane_form` chose for one structure of runs. The types of the
@@ -739,7 +736,7 @@ class _Leaf(CPUDispatcher):
             if loaded is not None:
                 return loaded
 
-        # Report the compilation, as Numba's own method does.
+        # Report the compilation like Numba's own method.
         data = {"dispatcher": self, "args": argument_types}
         with event.trigger_event("numba:compile", data=data):
             compiled = self._compiler.compile(argument_types, return_type)
@@ -749,15 +746,15 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Compiles a function for arguments of given types, so that calls need not check the types.
+    """Compiles a function for the types of the given arguments, to avoid checks on each call.
 
-    A control loop calls such a function in each period. The result must only be called with
-    arguments of the same types as those given here. If Numba is disabled, the function itself
-    is returned.
+    Used for functions that a control loop calls in every period. The result must only be called
+    with arguments of the same types as those given here. If Numba is disabled, returns the
+    function itself.
 
     Args:
-        function: A function with the decorator `leaf`.
-        *arguments: Examples of the arguments.
+        function: A function decorated with `leaf`.
+        *arguments: Example arguments.
     """
     if _config.DISABLE_JIT:
         return function
@@ -767,12 +764,11 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a numerical function to be compiled by Numba at its first call (decorator).
+    """Decorator that compiles a numerical function with Numba on its first call.
 
-    In contrast to `numba.njit`, the compiled code is stored on disk and found again until a
-    source file of this package changes, and the function must not allocate arrays. The type of
-    the function is unchanged for readers and type checkers. If Numba is disabled, the function
-    itself is returned.
+    Unlike with `numba.njit`, the function must not allocate arrays, and the compiled code is
+    cached on disk until a source file of this package changes. Readers and type checkers see
+    the type of the original function. If Numba is disabled, returns the function itself.
     """
     if _config.DISABLE_JIT:
         return function
@@ -780,11 +776,11 @@ def leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Callable[P, R]:
-    """Wraps a numerical function in an object that compiles it at its first call.
+    """Wraps a numerical function in an object that compiles it on its first call.
 
     Args:
         function: The Python function.
-        compiler: Class that compiles it.
+        compiler: Compiler class to use.
     """
     dispatcher = cast(Any, _Leaf)(
         function, targetoptions=dict(_LEAF_OPTIONS), pipeline_class=compiler
@@ -794,29 +790,28 @@ def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Calla
 
 
 def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function with a long loop that calls other leaves (decorator).
+    """Decorator for a function with a long loop that calls other leaves.
 
-    All leaves that the loop calls become part of its code. This saves the time for passing
-    descriptions of arrays to these leaves. Python calls the function like any other leaf.
+    All leaves called by the loop are inlined into its code, which saves the cost of passing
+    array descriptors to them. Python calls the function like any other leaf.
     """
     return leaf(function) if _config.DISABLE_JIT else _make_leaf(function, _LoopCompiler)
 
 
 def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function that computes several simulations at once, by SIMD (decorator).
+    """Decorator for a function that computes several simulations at once, using SIMD.
 
-    Each simulation has a lane, a position in the processor's vector registers. The compiler
-    needs two guarantees, which apply to the marked function only: all functions that it calls
-    become part of its code, and no two of its arguments overlap in memory. The caller has to
-    make sure that no arguments overlap. Such a function is called from compiled code by its
-    address (`LaneCode`).
+    Each simulation occupies a lane, which is a position in the processor's vector registers.
+    The compiler needs two guarantees, for the decorated function only: all functions that it
+    calls are inlined, and no two of its arguments overlap in memory. The caller must ensure the
+    latter. Compiled code calls such a function by its address (`LaneCode`).
     """
     return _make_leaf(function, _LaneCompiler)
 
 
 @cache
 def _make_unstored(function: Callable[..., Any]) -> Any:
-    """Wraps a function for several simulations side by side whose code is not stored on disk.
+    """Wraps a function for several simulations side by side, without caching its code on disk.
 
     It is compiled again in each process.
     """
@@ -829,8 +824,8 @@ class LaneCode:
     """Machine code of a function that computes several simulations side by side.
 
     Args:
-        function: A function with the decorator `lane_leaf`.
-        argument_types: Numba's types of its arguments.
+        function: A function decorated with `lane_leaf`.
+        argument_types: Numba types of its arguments.
     """
 
     def __init__(self, function: Callable[..., Any], argument_types: tuple[Any, ...]) -> None:
@@ -838,10 +833,10 @@ class LaneCode:
         self._argument_types = argument_types
 
     def find_address(self) -> int:
-        """Returns the memory address of the code, by which other compiled code calls it.
+        """Returns the memory address at which other compiled code can call this code.
 
-        The function is compiled if needed. Its code is not stored on disk if the attribute
-        `is_stored` of some argument type is False.
+        Compiles the function if necessary. The code is not cached on disk if any argument type
+        has an `is_stored` attribute that is False.
         """
         dispatcher = self._dispatcher
         is_stored = all(getattr(kind, "is_stored", True) for kind in self._argument_types)
@@ -852,9 +847,10 @@ class LaneCode:
         return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
     def is_stored(self) -> bool:
-        """Returns True if the machine code is on disk already.
+        """Returns True if the machine code is already on disk.
 
-        If not, the first use of the function takes long, because it has to be compiled.
+        If not, the first use of the function is slow, because the function must be compiled
+        first.
         """
         dispatcher = self._dispatcher
         if self._argument_types in dispatcher.overloads:
@@ -866,8 +862,8 @@ class LaneCode:
     def read_assembly(self) -> str:
         """Returns the assembly code of the function.
 
-        A test checks that it contains vector instructions, without which the function would be
-        slow.
+        A test uses it to check that the code contains vector instructions, without which the
+        function would be slow.
         """
         # Numba has no assembly text for code from the cache.
         compiled = _make_unstored(self._dispatcher.py_func)
@@ -878,14 +874,14 @@ class LaneCode:
 def set_lane_form(
     function: Callable[..., Any], choose: Callable[[tuple[Any, ...]], Callable[..., Any]]
 ) -> None:
-    """Registers another version of a function, for code that computes several simulations.
+    """Registers another version of a function for code that computes several simulations.
 
-    For example, `compute_law` of `core.lanes.lane_laws` has a version for each control law,
+    For example, `compute_law` of `core.lanes.lane_laws` has one version per control law,
     because all simulations that are computed side by side use the same law.
 
     Args:
-        function: A function with the decorator `leaf`.
-        choose: Function that returns the implementation for given types of the arguments.
+        function: A function decorated with `leaf`.
+        choose: Function that returns the implementation for given argument types.
     """
     if not _config.DISABLE_JIT:
         dispatcher: Any = function
@@ -893,11 +889,10 @@ def set_lane_form(
 
 
 class _NamedCache(_LeafCache):
-    """Stores the machine code of a closure on disk, under a name that the caller chooses.
+    """Caches the machine code of a closure on disk, under a name chosen by the caller.
 
-    A closure is a function that uses variables of an outer function. Numba would identify the
-    closure by the values of these variables. In this class, the name identifies everything that
-    the code depends on.
+    Numba would identify the closure by the values of the variables that it captures. In this
+    class, the name identifies everything that the code depends on.
     """
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:
@@ -907,22 +902,22 @@ class _NamedCache(_LeafCache):
 def compile_named(
     function: Callable[..., None], name: str, signature: Any, **options: Any
 ) -> Any:
-    """Compiles a closure, and stores its machine code on disk under a name.
+    """Compiles a closure, and caches its machine code on disk under a name.
 
-    A closure is a function that uses variables of an outer function. If a closure with this
-    name was compiled before, its code is loaded. The caller must therefore derive the name from
-    everything that the code depends on. The name is part of the symbols of the machine code: no
-    two such functions may have the same name in any process.
+    If a closure with this name was compiled before, its code is loaded instead. The name must
+    therefore be derived from everything that the code depends on, including the variables
+    captured by the closure. It is also used for the symbols in the machine code, so no two such
+    functions in a process may share a name.
 
     Args:
         function: The closure. Its qualified name is changed to `name`.
         name: Name of the function.
-        signature: Numba's signature of the function.
-        **options: Options of `numba.njit`. The options that all leaves have in common, such as
-            no counting of references, take precedence.
+        signature: Numba signature of the function.
+        **options: Options for `numba.njit`. The options shared by all leaves, such as disabling
+            reference counting, take precedence.
 
     Returns:
-        Numba's dispatcher of the compiled function.
+        Numba's dispatcher for the compiled function.
     """
     function.__qualname__ = name
     # The common options apply to both new and loaded code: neither counts references.

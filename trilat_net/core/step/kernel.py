@@ -1,9 +1,8 @@
-"""Computes one period of the control loop of an arm, as compiled code.
+"""Computes one control period (tick) of a site in compiled code.
 
-The process that runs one arm is called a site, and one period of its control loop a tick. A
-tick has eight stages, in this order:
+A tick has eight stages, executed in this order:
 
-- 1 accept: store the samples (states) that arrived from other sites.
+- 1 accept: store the samples that arrived from other sites.
 - 2 release: take the newest sample of each site whose simulated delay has passed.
 - 3 reference: compute the position that the arm should follow.
 - 4 errors: compute the tracking errors.
@@ -12,16 +11,16 @@ tick has eight stages, in this order:
 - 7 emit: write the record, which contains the results of the tick.
 - 8 advance: simulate the arm until the next tick.
 
-The state of a site is a row of numbers, `SiteRow`, which the stages read and write. For an arm
-that is a chain of joints, `chain` contains the data of its joints. For the planar two-link arm
-it is None.
+The stages read and write the state of a site, stored as a row of type `SiteRow`. For an arm
+that is a chain of joints, `chain` contains the joint data; for the planar two-link arm it is
+None.
 
 Invariant:
-    - Live sites and the fused run, a simulation of all sites in one compiled loop, call the
+    - Live sites and the fused run (a simulation of all sites in one compiled loop) call the
       same functions for the stages.
-    - Stage 8 integrates with the classical Runge-Kutta method of fourth order. The torque of
-      the motors is constant during the tick. The torques of operators and environments are
-      computed anew in each of the four evaluations, unless they are marked as sampled.
+    - Stage 8 integrates with the classical fourth-order Runge-Kutta method. Motor torque is
+      constant during the tick. The torques of operators and environments are recomputed at each
+      of the four evaluations, unless they are marked as sampled.
 """
 
 from math import isfinite
@@ -55,14 +54,14 @@ _USER = int(Law.USER)
 def _place_arm(
     s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
 ) -> None:
-    """Computes the positions of an arm's links, before its tracking errors are computed.
+    """Computes the positions of an arm's links, which the tracking errors require.
 
-    If `updates_reference` is True, the orientation that the end effector should follow is
-    computed too. The planar arm needs neither, because its equations contain the positions of
-    its links.
+    If `updates_reference` is True, this also computes the orientation that the end effector
+    should follow. The planar arm needs neither, because its equations contain the link
+    positions.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         links: State of each link from another site, one row per link.
         updates_reference: True in a tick, False if the reference was restored from a record.
@@ -78,11 +77,11 @@ def _place_arm(
 def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
     """Computes the tracking errors e, ed and r of an arm, and the dynamics that its law needs.
 
-    The error e is the position minus the reference, ed its derivative, and r the filtered
-    error. This is stage 4 of a control period.
+    e is the position minus the reference, ed its derivative, and r the filtered error. This is
+    stage 4 of a control period.
 
     Args:
-        s: State of the site (the process that runs the arm); changed.
+        s: State of the site; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     if chain is None:
@@ -95,14 +94,14 @@ def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
 def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
     """Advances the estimated parameters to theta_hat - gain_s Gamma Yr, within their bounds.
 
-    Gamma is the adaptation gain, and Yr the product Y' r of the regressor and the filtered
+    Gamma is the adaptation gain, and Yr is the product Y' r of the regressor and the filtered
     error.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         gain_s: Duration of the step, s.
-        Yr: Y' r of Eq. (15), one number per parameter.
+        Yr: Y' r of Eq. (15), one entry per parameter.
     """
     if chain is None:
         two_link_stages.advance_estimate(s, gain_s, Yr)
@@ -112,10 +111,10 @@ def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vec
 
 @leaf
 def adapts(s: SiteRow) -> bool:
-    """Returns True if the estimate of the arm's parameters may change in the present mode.
+    """Returns True if the estimate of the arm's parameters may change in the current mode.
 
-    It may not change in DIVERGED. While the arm rests, it changes only if the torque at rest is
-    that of the control law, see `rests_by_law`.
+    The estimate is frozen in the mode DIVERGED. While the arm is at rest, it changes only if
+    the arm is held by the torque of the control law; see `rests_by_law`.
     """
     return bool(s.mode != _DIVERGED and (rests_by_law(s) or not rests(s)))
 
@@ -125,22 +124,21 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
     """Updates the estimate of the arm's dynamic parameters (stage 5 of a tick).
 
     The estimate theta obeys Eq. (15) of the paper, dtheta/dt = -Gamma Y' r, where Gamma is the
-    matrix of the adaptation gains, Y the regressor and r the filtered error. The trapezoid rule
-    with the period h gives
+    matrix of adaptation gains, Y the regressor and r the filtered error. The trapezoidal rule
+    with period h gives
 
         theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
 
     The rule is explicit, because Y' r does not depend on the estimate. The scheme DIGITAL
-    advances the estimate by the Euler rule at the end of the tick instead, in stage 8.
+    instead advances the estimate with the Euler method at the end of the tick, in stage 8.
 
     Args:
-        k: Number of the tick (control period).
-        s: State of the site (the process that runs the arm). `Yr` is Y' r of tick k.
-            `Yr_before` is that of tick k - 1, and is overwritten with the sum of both; stage 8
-            sets it anew.
+        k: Current tick.
+        s: State of the site. `Yr` is Y' r of tick k. `Yr_before` is that of tick k - 1, and is
+            overwritten with the sum of both until stage 8 sets it again.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
-    # `adapts` is evaluated last, because it is the costly condition.
+    # `adapts` is evaluated last, because it is the expensive condition.
     if updates_estimate(k, s) and adapts(s):
         sum_trapezoid(s)
         _advance_estimate(s, chain, 0.5 / s.rate_hz, s.Yr_before)
@@ -150,19 +148,19 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 def updates_estimate(k: int, s: SiteRow) -> bool:
     """Returns True if an adaptive law integrates its parameter estimate in this control period.
 
-    The result is False in the first period of an arm's process, and under the scheme `digital`,
-    which integrates at the end of the period. `adapts` decides whether the mode allows
-    adaptation.
+    This is never the case in the first period of a site, nor under the scheme `digital`, which
+    integrates at the end of the period. Whether the mode allows adaptation is decided by
+    `adapts`.
     """
     return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Adds the adaptation rate Y' r of the previous control period to the present rate.
+    """Adds the adaptation rate Y' r of the previous control period to the current rate.
 
-    The estimate of the arm's parameters is integrated by the trapezoid rule, which needs this
-    sum. It is written into `Yr_before`, see `_update_estimate`.
+    The parameter estimate is integrated with the trapezoidal rule, which needs this sum. The
+    result is stored in `Yr_before`; see `_update_estimate`.
     """
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -172,12 +170,10 @@ def sum_trapezoid(s: SiteRow) -> None:
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
     """Computes the torque of a control law that is built into the compiled simulation.
 
-    The function does nothing for a law that was written as a Python class; `law_stage` calls
-    such a law.
+    Does nothing for a law written as a Python class, which is called by `law_stage`.
 
     Args:
-        site: State of the site (the process that runs the arm), shape (1,). The torque is
-            written into it.
+        site: State of the site, shape (1,). The torque is written to it.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     s: SiteRow = site[0]
@@ -191,15 +187,15 @@ def torque_stage(site: RowArray, chain: RowArray | None) -> None:
 
 @leaf
 def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> None:
-    """Computes the torque that holds the arm, from its known or estimated parameters.
+    """Computes the torque that holds the arm, using its known or estimated parameters.
 
-    This torque holds an arm at rest if the control law cannot do so. The estimate is used for
+    This torque holds an arm at rest if the control law cannot. The estimate is used for
     adaptive laws, and for arms with unknown parameters.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        torque: Receives the torque, shape (n,), N m.
+        torque: Output array for the torque, shape (n,), N m.
     """
     is_model_unknown = s.law == _USER and s.theta_known == 0
     uses_estimate = s.law == _ADAPTIVE or is_model_unknown
@@ -212,30 +208,30 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 
 @leaf
 def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Turns the torque of the control law into the torque that the motors get.
+    """Converts the torque of the control law to the torque sent to the motors.
 
-    The function is called after the law has written the torque `tau`. The rate of every torque
-    is limited. Under the rule `glide`, by which an arm comes to rest while another arm is
-    silent, the torque is first modified in these cases:
+    Called after the law has written its torque to `tau`. The rate of change is always limited.
+    Under the rule `glide` (where an arm comes to rest while another arm is silent), the torque
+    is modified first in the following cases:
 
-    - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
-    - The arm comes to rest or is at rest: damping and an integral term are added, see
-      `resting`. If the law cannot hold the arm, the gravity torque replaces that of the law.
-    - The arm has just left its rest: the torque blends from the torque at rest to the torque of
-      the law.
+    - The torque is not finite: the mode changes to FAULT, in which the arm comes to rest.
+    - The arm is at rest or coming to rest: damping and an integral term are added, see
+      `resting`. If the law cannot hold the arm, its torque is replaced with the gravity torque.
+    - The arm has just left rest: the torque is blended from the rest torque to the law's
+      torque.
 
     Args:
-        k: Number of the tick, a period of the control loop.
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        s: State of the site (the process that runs the arm); changed.
+        k: Current tick.
+        t_ns: Nominal time of the tick, ns since the epoch (the common start of the session).
+        s: State of the site; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     resting = False
     if s.on_stale == _GLIDE:
-        # A site with the reason NOT_FINITE is in FAULT already, and does not enter it again.
+        # A site with the reason NOT_FINITE is already in FAULT, and does not enter it again.
         if s.reason != _NOT_FINITE and s.mode != _DIVERGED and not is_torque_finite(s):
             latch_mode(t_ns, s, _FAULT, _NOT_FINITE)
-        # The mode may have just become FAULT, in which the arm rests.
+        # The mode may just have changed to FAULT, in which the arm rests.
         resting = rests(s)
         if resting:
             if not rests_by_law(s):
@@ -251,20 +247,20 @@ def guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def _write_record(s: SiteRow, row: Array) -> None:
-    """Writes the results of a control period as one vector of numbers, for the log.
+    """Writes the results of a control period as a single vector of floats, for the log.
 
-    The order is that of `Layout.columns`: motion, reference, torques, parameter estimate, and
-    the motion of the end effector if arms follow each other's end effectors. A number that is
-    not finite becomes 0, and the arm enters the mode DIVERGED.
+    The order is that of `Layout.columns`: motion, reference, torques, parameter estimate, and,
+    if arms follow each other's end effectors, the motion of the end effector. If a value is not
+    finite, it is replaced with 0, and the arm enters the mode DIVERGED.
 
     Args:
-        s: State of the site (the process that runs the arm).
-        row: Receives the numbers.
+        s: State of the site.
+        row: Output array for the values.
     """
     joints = s.joints
     shared = s.shared
     parameters = s.parameters
-    # `first` is the index of the first number of the next group.
+    # `first` is the index of the first value in the next group.
     first = 2 * joints
     for i in range(joints):
         row[i] = s.q[i]
@@ -275,8 +271,8 @@ def _write_record(s: SiteRow, row: Array) -> None:
     first += 2 * shared
     for i in range(joints):
         row[first + i] = s.tau[i]
-        # This is a subtraction, not a negation, so that the record has 0.0 and not -0.0 where
-        # nothing acts.
+        # A subtraction instead of a negation, so that the record contains 0.0 and not -0.0
+        # where nothing acts.
         row[first + joints + i] = 0.0 - s.on_arm[i]
     first += 2 * joints
     for p in range(parameters):
@@ -298,15 +294,13 @@ def _write_record(s: SiteRow, row: Array) -> None:
 def _update_external_torque(
     t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque that operators and environments exert on the arm at a time.
-
-    An operator is a model of a person who moves the arm, and an environment a wall or a damper.
+    """Computes the torque that operators and environments exert on the arm at a given time.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     if chain is None:
@@ -326,18 +320,18 @@ def _advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Simulates the motion of the arm, joint angles and velocities, over one control period.
+    """Simulates the joint angles and velocities of the arm over one control period.
 
     Args:
-        t_s: Time at the beginning of the period, s since the start of the session.
-        h_s: The period, s.
-        s: State of the site (the process that runs the arm).
+        t_s: Time at the start of the period, s since the start of the session.
+        h_s: Length of the period, s.
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
 
     Returns:
-        False, without a change, if the result is not finite.
+        True on success. False if the result is not finite, in which case nothing is changed.
     """
     if chain is None:
         return two_link_stages.advance_arm(t_s=t_s, h_s=h_s, s=s, actors=actors, table=table)
@@ -348,18 +342,18 @@ def _advance_arm(
 
 @leaf
 def hold_motor_torque(k: int, s: SiteRow) -> None:
-    """Computes the motor torque u that is held during the whole control period.
+    """Computes the motor torque u that is held constant during the control period.
 
-    The constant torque that represents the period best is the torque in the middle of the
-    period. It is extrapolated from the torques of this tick and the previous tick:
+    The constant torque that best represents the period is the torque at its midpoint,
+    extrapolated from this tick and the previous one:
 
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
     At the first tick, and under the scheme DIGITAL, u = tau_k.
 
     Args:
-        k: Number of the tick (control period).
-        s: State of the site (the process that runs the arm); `u` and `q_before` are written.
+        k: Current tick.
+        s: State of the site. `u` and `q_before` are written.
     """
     for i in range(s.q.shape[0]):
         s.q_before[i] = s.q[i]
@@ -377,11 +371,11 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
     """Stores the torque and the adaptation rate Y' r of this tick for the next tick.
 
-    Y' r drives the parameter estimate, see `_update_estimate`. Under the scheme DIGITAL the
-    estimate itself is advanced here.
+    Y' r drives the parameter estimate; see `_update_estimate`. Under the scheme DIGITAL, this
+    function also advances the estimate itself.
 
     Args:
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
         is_adapting: Result of `adapts` before the arm moved.
     """
@@ -406,11 +400,11 @@ def _advance(
     """Simulates the arm until the next control period, and stores what that period needs.
 
     Args:
-        k: Number of the tick (control period).
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site (the process that runs the arm).
+        s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments of the arm, one row for each.
+        actors: Operators and environments of the arm, one row each.
         table: Numerical data of all operators and environments, for example recorded torques.
     """
     h_s = 1.0 / s.rate_hz
@@ -428,17 +422,17 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns the arrays for the values that the control law of one other arm (peer) sends.
+    """Selects the arrays for the values sent by the control law of one peer.
 
-    Some laws send values besides the motion of the arm, for example energies.
+    Some laws send values other than the motion of the arm, for example energies.
 
     Args:
-        channel: Arrays of all peers of a site, or of all sites of a simulation. None if the
-            control law of this site reads no such values.
+        channel: Arrays of all peers of a site, or of all sites of a simulation. None if this
+            site's control law reads no such values.
         peer: Index of the peer, or of the site.
 
     Returns:
-        Views of the arrays of the peer or the site. None if `channel` is None.
+        Views of the arrays, or None if `channel` is None.
     """
     if channel is None:
         return None
@@ -447,11 +441,11 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 
 @leaf
 def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
-    """Returns the arrays of the network link from one other arm, as views without copying.
+    """Returns the arrays of the network link from one peer, as views without copying.
 
-    `LinkArrays` describes the arrays of a link. Nearly all of them are rows of this arm's
-    arrays, one row per other arm (peer). `state` is a slice, because it must stay an array, of
-    shape (1,). `points` is the table of all links, in which each link has rows of its own.
+    The arrays are described in `LinkArrays`. Nearly all of them are rows of this arm's arrays,
+    one row per peer. `state` is a slice of shape (1,), because it must remain an array.
+    `points` is the table of all links, in which each link has its own rows.
 
     Args:
         arrays: Arrays of the site.
@@ -469,34 +463,31 @@ def _link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Finds the control period of this arm in which a message from another arm is first used.
-
-    A message (sample) is the state that the other arm sends once per period of its own loop.
+    """Finds the control period of this arm in which a peer's sample is first used.
 
     Args:
         peer: Index of the peer.
-        tick: Number of the period in which the peer sent the sample.
+        tick: Tick in which the peer sent the sample.
         arrays: Arrays of the site.
 
     Returns:
-        The number of the period if the sample arrives in time. LOST if the link loses the
-        sample, or if the sample is too old.
+        The tick of this site if the sample arrives in time. LOST if the link drops the sample,
+        or if the sample is too old.
     """
     return release_tick(tick, arrays.site[0].rate_hz, _link_arrays(arrays, peer))
 
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stores the messages that arrived, until their simulated network delay has passed.
+    """Stores the messages that arrived until their simulated network delay has passed.
 
-    A message (sample) is the state that another arm sends once per control period. Messages
-    wait in ring buffers, which are called calendars.
+    The ring buffers in which messages wait are called calendars.
 
     Args:
-        k: Number of the present control period.
-        count: Number of samples that arrived since the previous period.
-        arrays: Arrays of the site (the process that runs the arm); written.
-        buffers: Contains the samples.
+        k: Current tick.
+        count: Number of samples that arrived since the previous tick.
+        arrays: Arrays of the site; updated in place.
+        buffers: Buffers that contain the samples.
     """
     rate_hz = arrays.site[0].rate_hz
     for n in range(count):
@@ -515,15 +506,14 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
 
 @leaf
 def guard_reference(k: int, t_ns: int, s: SiteRow, links: RowArray) -> None:
-    """Stops the reference while other arms are silent, and limits its speed.
+    """Limits the speed of the reference, and stops it while peers are silent.
 
-    The reference is the position that the arm follows. It stops if no messages arrive from the
-    other arms for too long.
+    The reference stops if no messages have arrived from the peers for too long.
 
     Args:
-        k: Number of the tick (control period).
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site, with the reference; changed.
+        s: State of the site, including the reference; updated in place.
         links: States of the links from the other sites.
     """
     if s.on_stale == _GLIDE:
@@ -545,15 +535,15 @@ def error_stages(
 ) -> None:
     """Computes the tracking errors, the parameter estimate and the external torque of an arm.
 
-    These are stages 4 and 5 of a control period, after the reference is known and before the
+    These are stages 4 and 5 of a control period, which follow the reference and precede the
     control law.
 
     Args:
-        k: Number of the tick, a period of the control loop.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        s: State of the site (the process that runs the arm), with the reference; written.
+        s: State of the site, including the reference; updated in place.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        actors: Operators and environments, one row for each.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments.
     """
     # 4 errors
@@ -576,17 +566,17 @@ def reference_stages(
 ) -> None:
     """Computes the reference, tracking errors and parameter estimate of a control period.
 
-    The reference is the position that the arm follows. It results from the newest states of the
-    other arms whose network delay has passed. Finally, the external torque of operators and
-    environments is computed.
+    The reference (the position to follow) is derived from the newest states of the peers whose
+    network delay has passed. The external torque of operators and environments is computed
+    last.
 
     Args:
-        k: Number of the tick, a period of the control loop.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        site: State of the site (the process that runs the arm), shape (1,); written.
+        site: State of the site, shape (1,); updated in place.
         links: States of the links from the other sites, one row per link.
-        ramps: Planned changes of the weights with which the arm follows the other arms.
-        actors: Operators and environments, one row for each.
+        ramps: Planned changes of the dominance factors.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
@@ -604,23 +594,20 @@ def sense_stages(
 ) -> None:
     """Computes the part of a tick that precedes the control law (stages 1 to 5).
 
-    A tick is one period of the control loop. A sample is the state that a peer, another arm's
-    process, sends in one of its ticks. The stages are:
-
     - 1 accept: store the samples that arrived, until their simulated delay has passed.
     - 2 release: take the newest sample of each peer whose delay has passed.
     - 3 reference: compute the position that the arm should follow.
     - 4 errors: compute the tracking errors.
     - 5 estimate: update the estimate of the arm's dynamic parameters.
 
-    Finally, the torque of operators and environments on the arm is computed.
+    Finally, the torque exerted on the arm by operators and environments is computed.
 
     Args:
-        k: Number of the tick (control period).
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        k: Current tick.
+        t_ns: Nominal time of the tick, ns since the epoch (the common start of the session).
         count: Number of samples that arrived since the previous tick.
-        arrays: Arrays of the site (the process that runs the arm), see `SiteArrays`; written.
-        buffers: Contains the samples that arrived.
+        arrays: Arrays of the site, see `SiteArrays`; updated in place.
+        buffers: Buffers that contain the samples that arrived.
     """
     rate_hz = arrays.site[0].rate_hz
     # Samples wait in a ring buffer with one page per tick. The pages of the ticks that the site
@@ -649,15 +636,14 @@ def sense_stages(
 
 @leaf
 def emit_stage(s: SiteRow, record: Array) -> None:
-    """Writes the results of a control period into its record, which is logged (stage 7).
+    """Writes the results of a control period to its record, for the log (stage 7).
 
-    If a joint is faster than its limit, the run of this arm ends in the mode DIVERGED. Under
-    the rule `glide`, the arm comes to rest instead, see `session_life`.
+    If a joint exceeds its speed limit, the run of this arm ends in the mode DIVERGED. Under the
+    rule `glide`, the arm comes to rest instead; see `session_life`.
 
     Args:
-        s: State of the site (the process that runs the arm), with the torque of the motors;
-            written.
-        record: Receives the floating-point numbers of the record, the results of the tick.
+        s: State of the site, including the motor torque; updated in place.
+        record: Output array for the floating-point values of the record.
     """
     for i in range(s.joints):
         is_within_limit = abs(s.qd[i]) <= s.qd_limit[i]  # False for NaN
@@ -678,18 +664,17 @@ def act_stages(
 ) -> None:
     """Computes the part of a control period that follows the control law.
 
-    The torque is limited, the results are written for the log, and the arm moves to the next
-    period (stages 6 to 8). See `emit_stage` for a joint that is faster than its limit.
+    Limits the torque, writes the record and moves the arm to the next period (stages 6 to 8).
+    For joints that exceed their speed limit, see `emit_stage`.
 
     Args:
-        k: Number of the tick, a period of the control loop.
+        k: Current tick.
         t_ns: Nominal time of the tick, ns since the start of the session.
-        site: State of the site (the process that runs the arm), shape (1,), with the torque of
-            the law; written.
-        actors: Operators and environments, one row for each.
+        site: State of the site, shape (1,), including the torque of the law; updated in place.
+        actors: Operators and environments, one row each.
         table: Numerical data of all operators and environments.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        record: Receives the floating-point numbers of the record, the results of the tick.
+        record: Output array for the floating-point values of the record.
     """
     s: SiteRow = site[0]
     guard_torque(k, t_ns, s, chain)
@@ -721,14 +706,13 @@ def site_tick(
     sent: Array,
     record: Array,
 ) -> None:
-    """Computes one whole control period of an arm, with a control law that is built in.
+    """Computes one complete control period of an arm that uses a built-in control law.
 
-    The number of the period (tick) is k, and its nominal time t_ns is in ns since the start of
-    the session. Only the first `count` rows of `arrivals` are read; they are the messages that
-    arrived.
+    `k` is the tick, and `t_ns` its nominal time in ns since the start of the session. Only the
+    first `count` rows of `arrivals`, which hold the messages that arrived, are read.
 
-    All other arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed one by
-    one, because passing the two tuples from Python takes a microsecond longer.
+    The remaining arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed
+    individually because passing the two tuples from Python takes a microsecond longer.
     """
     arrays = SiteArrays(
         site=site,
@@ -759,15 +743,14 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Completes the state of an arm that was restored from a log, to continue the run.
+    """Completes the state of an arm restored from a log, to allow the run to continue.
 
-    Some values that the next control period needs are not in the log: the tracking errors, the
-    external torques, and the motion until that period. They are computed here from the restored
-    state. Control periods are called ticks.
+    Some values that the next tick needs are not in the log: the tracking errors, the external
+    torques, and the motion up to that tick. They are recomputed here from the restored state.
 
     Args:
-        k: The last tick that was recorded.
-        arrays: Arrays of the site, with the restored state; changed.
+        k: The last recorded tick.
+        arrays: Arrays of the site, with the restored state; updated in place.
     """
     s: SiteRow = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)

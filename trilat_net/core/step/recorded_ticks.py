@@ -1,16 +1,15 @@
 """Verifies many recorded control periods of an arm in one compiled loop.
 
-A log has a record of each control period (tick), with its inputs, such as the received states
-of the other arms, and its results. The loop computes the ticks again from their inputs and
-compares the results. The loop gives the same results as repeated calls of `Site.step`, but
-faster.
+A log contains a record of each tick, with its inputs (such as the states received from other
+arms) and its results. The loop recomputes the ticks from their inputs and compares the results.
+It is equivalent to repeated calls of `Site.step`, but faster.
 
 Invariant:
-    - The loop calls the stages of the kernel, as `Site.step` does. It contains no equation.
-    - A row of the record counts as repeated only if every computed number has the same bits.
-    - The loop ends before the first tick that it cannot execute or does not repeat. The site
-      (the state of the arm and its controller) is then in the state before this tick, and
-      `Site.step` can execute it.
+    - The loop calls the stages of the kernel, as `Site.step` does. It contains no equations of
+      its own.
+    - A record counts as reproduced only if every computed value is bit-identical.
+    - The loop stops before the first tick that it cannot execute or does not reproduce. The
+      site is then in the state before that tick, and `Site.step` can execute it.
 """
 
 import zlib
@@ -36,14 +35,15 @@ _ALL_BITS = 0xFFFFFFFF
 
 
 def _list_checksums() -> NDArray[np.uint32]:
-    """Returns tables with which a CRC-32 checksum is updated by eight bytes at once.
+    """Returns lookup tables for updating a CRC-32 checksum eight bytes at a time.
 
-    CRC-32 is linear in the bits of the message, except for a constant. Therefore the effect of
-    a byte depends only on its value and on the number of bytes that follow. The tables assume
-    that the following bytes are zero.
+    CRC-32 is linear in the bits of the message, except for a constant. The effect of a byte
+    therefore depends only on its value and on the number of bytes that follow. The tables
+    assume that the following bytes are zero.
 
     Returns:
-        The effect by number of following bytes and value of the byte, shape (8, 256).
+        The effect of a byte, indexed by the number of following bytes and the value of the
+        byte, shape (8, 256).
     """
     table = np.zeros((_WORD_BYTES, _BYTE_VALUES), np.uint32)
     for following in range(_WORD_BYTES):
@@ -62,11 +62,11 @@ _CHECKSUMS = _list_checksums()
 def _update_checksum(crc: int, word: int) -> int:
     """Returns a CRC-32 checksum after eight more bytes of data.
 
-    The final inversion of all bits, which belongs to CRC-32, is left to the caller.
+    The final bit inversion of CRC-32 is left to the caller.
 
     Args:
-        crc: The checksum of the preceding data.
-        word: The eight bytes as an integer, least byte first.
+        crc: Checksum of the preceding data.
+        word: The eight bytes as a little-endian integer.
     """
     bits = crc ^ word
     result = 0
@@ -80,24 +80,24 @@ def _update_checksum(crc: int, word: int) -> int:
 class RecordedRows(NamedTuple):
     """Results of consecutive control periods of an arm from a log, as arrays for compiled code.
 
-    K is the number of periods, P the number of other arms, m the number of coordinates that the
-    arms share, n the number of joints. A word is the bits of a floating-point number as an
-    integer.
+    There are K ticks, P peers, m coordinates shared between arms, and n joints. A word is a
+    64-bit integer with the same bits as a floating-point value.
 
     Attributes:
-        bits: Numbers of the record, see `Layout.columns`, shape (K, floats), as words.
-        used: Tick of the sample in use of each peer, shape (K, P).
+        bits: Values of the records as words, see `Layout.columns`, shape (K, floats).
+        used: Tick of the sample in use from each peer, shape (K, P).
         modes: Mode, shape (K,), see `Mode`.
         checksums: CRC-32 of the arrivals, shape (K,).
-        first_memory: Index of the first number of `memory` of each record, shape (K + 1,).
-        memory: Numbers of the field `mem` of all records.
-        memory_words: The same numbers as words.
+        first_memory: Index of the first entry in `memory` of each record, shape (K + 1,).
+        memory: Contents of the field `mem` of all records.
+        memory_words: The same contents as words.
         first_arrival: Index of the first arrival of each record, shape (K + 1,).
-        arrivals: Peer, tick, and row in the table of samples of all N arrivals, shape (N, 3).
+        arrivals: Peer, tick, and row in the table of samples for each of N arrivals, shape (N,
+            3).
         hands: Grip, target, and target one second later of a live hand, shape (K, 1 + 2 m).
             Shape (0, 0) if the site has no live hand.
-        plants: q, qd and the torque ON an external arm, shape (K, 3 n). Shape (0, 0) if the
-            arm is not external.
+        plants: q, qd and the torque ON an external arm, shape (K, 3 n). Shape (0, 0) if the arm
+            is not external.
     """
 
     bits: IntArray
@@ -114,22 +114,21 @@ class RecordedRows(NamedTuple):
 
 
 class _SiteViews(NamedTuple):
-    """State of an arm's process as 64-bit integers, to compare it bit by bit with a log.
+    """State of a site viewed as 64-bit integers, to compare it bit by bit with a log.
 
-    A comparison of floating-point numbers would miss differences: 0.0 equals -0.0 although
-    their bits differ, and NaN is not equal to itself. The bits of a number as an integer are
-    called a word.
+    Comparing floating-point values would not work: 0.0 equals -0.0 although their bits differ,
+    and NaN is not equal to itself. A word is a 64-bit integer with the same bits as a value.
 
     Attributes:
-        site: State of the site (the process that runs the arm), as integers.
-        links: State of each link, one row per peer, one after another, as integers.
+        site: State of the site, as words.
+        links: State of each link, one row per peer, concatenated, as words.
         arrivals: Arrivals of a tick, shape (MAX_ARRIVALS, 2 + 2 m): peer, tick, q and qd.
         forces: External torques of the arrivals, shape (MAX_ARRIVALS, m), as words.
         record: Results of a tick, shape (floats,), as words.
-        memory: Sources of the numbers in the field `mem`, shape (M, 3): 1 for the links and 0
-            for the site, index in the row, and 1 for an integer that becomes a float.
-        rooms: For each peer the newest sample that is known to fit into the calendar, and how
-            many ticks a sample waits at most, shape (P, 2).
+        memory: Where each entry of the field `mem` comes from, shape (M, 3): 1 for the links or
+            0 for the site, index in the row, and 1 for an integer that is converted to a float.
+        rooms: For each peer, the newest sample known to fit into the calendar, and the largest
+            number of ticks that a sample waits, shape (P, 2).
     """
 
     site: IntArray
@@ -142,17 +141,17 @@ class _SiteViews(NamedTuple):
 
 
 class _TickRules(NamedTuple):
-    """Properties of an arm's process that stay the same during a run, for the compiled replay.
+    """Properties of a site that stay the same during a run, for the compiled replay.
 
     Attributes:
         rate_hz: Tick rate, Hz.
-        shared: Number m of the coordinates that the sites share.
+        shared: Number m of coordinates shared between sites.
         reflects: True if the checksum of the arrivals covers the external torques.
         keeps_forces: True if the site stores the external torques of its peers.
-        remembers: True if every record has numbers in the field `mem`.
+        remembers: True if the field `mem` of every record is non-empty.
         hand: Index of the live hand among the operators and environments, or -1.
-        most_pages: Largest number of entries of a calendar.
-        most_ahead: Largest number of ticks by which a sample may be ahead of the present tick.
+        most_pages: Largest number of entries per calendar.
+        most_ahead: Largest number of ticks by which a sample may be ahead of the current tick.
     """
 
     rate_hz: int
@@ -178,20 +177,20 @@ def _has_room(
 ) -> bool:
     """Returns True if the messages that arrived in a control period fit into their buffers.
 
-    Messages wait in a ring buffer per network link until their simulated delay has passed, with
-    one entry (page) per control period. Compiled code cannot enlarge the buffers. If a message
-    does not fit, the compiled loop ends, and `Site.step` computes the period. The rule is that
-    of `CalendarSizer.make_room`.
+    Each link has a ring buffer in which messages wait for their simulated delay to pass, with
+    one entry (page) per control period. Compiled code cannot enlarge these buffers. If a
+    message does not fit, the compiled loop stops, and `Site.step` computes the tick. The
+    criterion is the same as in `CalendarSizer.make_room`.
 
     Args:
-        k: Number of the tick (control period).
+        k: Current tick.
         first: Index of the first arrival of the tick.
         last: Index after its last arrival.
         arrivals: Peer and tick of each arrival, see `RecordedRows.arrivals`.
         links: State of each link, one row per peer.
-        pages: Number of pages of each calendar.
-        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
-        rooms: See `_SiteViews.rooms`; updated.
+        pages: Number of pages per calendar.
+        rules: Properties of the site, a `_TickRules`.
+        rooms: See `_SiteViews.rooms`; updated in place.
     """
     for n in range(first, last):
         peer = arrivals[n, 0]
@@ -212,23 +211,22 @@ def _has_room(
 def _put_arrivals(
     first: int, last: int, arrivals: IntArray, samples: IntArray, rules: Any, views: Any
 ) -> int:
-    """Writes the messages that arrived in a control period into the input buffers.
+    """Writes the messages that arrived in a control period to the input buffers.
 
-    A message (sample) is the state that another arm sent. The checksum of the messages is
-    computed at the same time, to compare it with the log.
+    Their checksum is computed at the same time, to be compared with the log.
 
     Args:
         first: Index of the first arrival of the tick.
         last: Index after its last arrival.
         arrivals: Peer, tick and sample of each arrival, see `RecordedRows.arrivals`.
         samples: Table of the samples, as words.
-        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
-        views: Memory of the site, a `_SiteViews`; its arrivals are written.
+        rules: Properties of the site, a `_TickRules`.
+        views: Memory of the site, a `_SiteViews`, whose arrivals are written.
 
     Returns:
         The CRC-32 of the arrivals, which must equal the checksum in the record.
     """
-    # A row of `samples` has positions, velocities and forces, `shared` numbers each.
+    # A row of `samples` contains positions, velocities and forces, with `shared` values each.
     shared = rules.shared
     first_force = 2 * shared
     crc = _ALL_BITS
@@ -258,14 +256,14 @@ def _put_arrivals(
 def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
     """Writes the recorded inputs of a control period that did not come from other arms.
 
-    These are the action of a person or program that moved the arm (live hand), and the motion
-    of a real arm that was measured. Most arms have neither.
+    These are the action of a person or program that moved the arm (live hand), and the measured
+    motion of a real arm. Most arms have neither.
 
     Args:
         row: Index of the record.
-        arrays: Arrays of the site; changed.
+        arrays: Arrays of the site; updated in place.
         rows: The records, a `RecordedRows`.
-        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
+        rules: Properties of the site, a `_TickRules`.
     """
     if rules.hand >= 0:
         hand = arrays.actors[rules.hand]
@@ -287,18 +285,17 @@ def _put_inputs(row: int, arrays: SiteArrays, rows: Any, rules: Any) -> None:
 def _equals_record(
     row: int, crc: int, arrays: SiteArrays, rows: Any, rules: Any, views: Any
 ) -> bool:
-    """Returns True if the results of a tick (control period) have the same bits as its record.
+    """Returns True if the results of a tick are bit-identical to its record.
 
-    The comparison covers the mode, the checksum of the samples (states of other arms) that
-    arrived, the tick of the sample in use of each other arm, all computed numbers, and the
-    numbers that are kept for the next tick.
+    The comparison covers the mode, the checksum of the samples that arrived, the tick of the
+    sample in use from each peer, all computed values, and the values kept for the next tick.
 
     Args:
         row: Index of the record.
         crc: CRC-32 of the arrivals of the tick.
         arrays: Arrays of the site after the tick.
         rows: The records, a `RecordedRows`.
-        rules: Properties of the site (the process that runs the arm), a `_TickRules`.
+        rules: Properties of the site, a `_TickRules`.
         views: The same memory of the site as words, a `_SiteViews`.
     """
     s: SiteRow = arrays.site[0]
@@ -324,7 +321,7 @@ def _equals_record(
         is_integer = views.memory[i, 2]
         computed_bits = views.links[index] if is_of_link else views.site[index]
         if is_integer:
-            # The record has the integer as a float, which is never -0.0.
+            # The record stores the integer as a float, which is never -0.0.
             logged = rows.memory[first + i]
             is_negative_zero = computed_bits == 0 and 1.0 / logged < 0.0
             if logged != float(computed_bits) or is_negative_zero:
@@ -343,24 +340,24 @@ def _run_recorded_ticks(
     arrays: SiteArrays,
     buffers: TickBuffers,
 ) -> tuple[int, bool]:
-    """Computes recorded control periods (ticks) again, until a result differs from the log.
+    """Recomputes recorded ticks until a result differs from the log.
 
-    One compiled call computes all of them, which is far faster than a call per tick.
+    Computing all of them in one compiled call is far faster than one call per tick.
 
     Args:
-        first_tick: Number of the first tick.
+        first_tick: First tick to compute.
         rows: Records of the ticks.
-        samples: Table of the samples that arrived, shape (N, 3 m), as the bits of the numbers:
-            q, qd, tau_x.
-        rules: Properties of the site (the process that runs the arm).
+        samples: Table of the samples that arrived, shape (N, 3 m). The columns are q, qd and
+            tau_x, each as the bits of a floating-point value.
+        rules: Properties of the site.
         views: State of the site as integers.
-        arrays: Arrays of the site; changed.
-        buffers: Input and output of a tick; changed.
+        arrays: Arrays of the site; updated in place.
+        buffers: Input and output of a tick; updated in place.
 
     Returns:
-        The number of ticks that were repeated exactly, and True if the next tick was computed
-        and differs. It is False if the next tick was not computed, because its samples do not
-        fit into the buffers, or because there is no further tick.
+        The number of ticks that were reproduced exactly, and whether the next tick was computed
+        but differs. The latter is False if the next tick was not computed, because its samples
+        do not fit into the buffers or because there are no more ticks.
     """
     for row in range(rows.modes.shape[0]):
         k = first_tick + row
@@ -397,13 +394,12 @@ _run_chain_ticks = leaf(_run_recorded_ticks)
 
 
 class TickRepeater:
-    """Computes recorded control periods of an arm again, many in one compiled call.
+    """Recomputes recorded control periods of an arm, many per compiled call.
 
-    Each result is compared with the log, to verify that the run can be reproduced. Control
-    periods are called ticks.
+    Each result is compared with the log, to verify that the run can be reproduced.
 
     Args:
-        site: State of the arm and its controller. The control law must be built in.
+        site: The site, which must use a built-in control law.
     """
 
     def __init__(self, site: Site) -> None:
@@ -433,16 +429,17 @@ class TickRepeater:
         self._saved = [np.empty_like(array) for array in self._list_arrays()]
 
     def repeat(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> int:
-        """Computes recorded control periods (ticks) again, until a result differs from the log.
+        """Recomputes recorded ticks until a result differs from the log.
 
         Args:
-            first_tick: Number of the first tick. It must be the next tick of the site.
+            first_tick: First tick, which must be the next tick of the site.
             rows: Records of consecutive ticks.
-            samples: Table of the samples that arrived, shape (N, 3 m), as the bits of the
-                numbers: q, qd, tau_x.
+            samples: Table of the samples that arrived, shape (N, 3 m). The columns are q, qd
+                and tau_x, each as the bits of a floating-point value.
 
         Returns:
-            The number of ticks that were repeated exactly. The site is in the state after them.
+            The number of ticks that were reproduced exactly. The site is left in the state
+            after them.
         """
         # Save the state, because a tick that differs has changed it.
         arrays = self._list_arrays()
@@ -466,19 +463,19 @@ class TickRepeater:
         return repeated
 
     def _list_arrays(self) -> list[NDArray[Any]]:
-        """Returns the arrays of the arm's process that a control period changes.
+        """Returns the arrays of the site that a control period modifies.
 
-        They are saved before a period and restored if it has to be computed again.
+        They are saved before a period, and restored if it has to be computed again.
         """
         a = self._site.arrays
         changed = [a.site, a.links, a.dues, a.calendars, a.ramps, a.actors, a.chain]
         return [array for array in changed if array is not None]
 
     def _run(self, first_tick: int, rows: RecordedRows, samples: IntArray) -> tuple[int, bool]:
-        """Calls the compiled loop over recorded control periods that matches the kind of arm.
+        """Calls the version of the compiled loop over recorded ticks for this type of arm.
 
-        The loop and `CalendarSizer`, which enlarges the buffers of waiting messages, tell each
-        other which messages fit into them.
+        The loop and `CalendarSizer`, which enlarges the buffers of waiting messages, share
+        their knowledge of which messages fit.
         """
         site = self._site
         self._views.rooms[:] = self._parts.calendar_sizer.list_rooms()
@@ -499,13 +496,13 @@ class TickRepeater:
 
 
 def _view_words(array: NDArray[Any]) -> IntArray:
-    """Returns the same memory as 64-bit integers, to compare all bits of floats.
+    """Views an array as 64-bit integers, to compare floats bit by bit.
 
-    Floats would compare 0.0 and -0.0 as equal. Nothing is copied, so a change of the array
+    As floats, 0.0 and -0.0 would compare equal. Nothing is copied, so changing the array
     changes the result.
 
     Args:
-        array: Array of numbers of 8 bytes, or a structured array of such numbers.
+        array: Array with 8-byte elements, or a structured array with 8-byte fields.
 
     Returns:
         The integers. A structured array becomes a matrix with one row per element.
@@ -519,11 +516,11 @@ def _view_words(array: NDArray[Any]) -> IntArray:
 
 
 def _list_memory_sources(site: Site) -> IntArray:
-    """Finds where an arm's process stores the numbers that the next control period needs.
+    """Finds where a site stores the values that the next control period needs.
 
-    A record of the log contains them in its field `mem`, unless another field has them. The
-    order is that of `Site.restore_state`, and `_SiteViews.memory` describes the three columns
-    of the result.
+    A record contains them in its field `mem`, unless another field has them. They are listed in
+    the order of `Site.restore_state`. The three columns of the result are described in
+    `_SiteViews.memory`.
     """
     sources: list[tuple[int, int, int]] = []
     parts = site.parts
@@ -531,10 +528,10 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds the positions of the numbers of one field, counted in words of eight bytes.
+        """Adds the positions of all elements of one field, counted in 8-byte words.
 
         Args:
-            dtype: Type of the row, that of the site or that of a link.
+            dtype: Type of the row (of the site or of a link).
             field: Name of the field.
             row: Index of the row.
         """

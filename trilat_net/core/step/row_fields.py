@@ -1,16 +1,16 @@
 """Defines the arrays that hold the state of a simulated arm and of its network links.
 
-They are NumPy structured arrays, whose elements are called rows. Each class below describes the
-fields of one kind of row, for example `q` in `SiteRow`: their shape, unit and meaning, and the
-stage of a control period that writes them. The types of the attributes serve readers and mypy,
-and `row_dtype` derives the memory layout from the `Field` of each attribute. `core/README.md`
-shows the same information as tables.
+They are NumPy structured arrays, whose elements are called rows. Each class below describes one
+kind of row. For each field, for example `q` in `SiteRow`, it states the shape, the unit, the
+meaning, and the stage of a control period that writes the field. The attribute types are there
+for readers and mypy; `row_dtype` derives the memory layout from the `Field` of each attribute.
+`core/README.md` shows the same information as tables.
 
 Invariant:
     - The order of the attributes is the order of the fields in memory. Digests of runs, cached
       machine code and users' compiled control laws depend on it.
-    - The compiled code of a control period keeps no state outside of these rows and of the
-      tables in `SiteArrays`.
+    - The compiled code of a control period keeps no state outside of these rows and the tables
+      in `SiteArrays`.
 """
 
 from collections.abc import Mapping
@@ -29,15 +29,15 @@ class Field(NamedTuple):
 
     Attributes:
         shape: Axes, joined by " x ". Each axis is a number, or a name such as "joints" whose
-            length depends on the arm. Empty for a single number.
-        unit: Unit of the numbers. If the field holds a member of an enumeration, the name of
-            the enumeration. Empty for counts, indices and flags.
-        meaning: Quantity that the field holds.
+            length depends on the arm. Empty for a scalar.
+        unit: Unit of the values. If the field holds a member of an enumeration, the name of the
+            enumeration. Empty for counts, indices and flags.
+        meaning: Quantity stored in the field.
         stage: Stage of a control period that writes the field, see README.md. Otherwise "setup"
             for constants, "input" for values that are written before the period, or "scratch"
             for intermediate results.
-        chain_only: True if only an arm that is a chain of joints has the field.
-        kind: NumPy's code of the number type.
+        chain_only: True if the field exists only for an arm that is a chain of joints.
+        kind: NumPy code of the element type.
     """
 
     shape: str
@@ -49,12 +49,11 @@ class Field(NamedTuple):
 
 
 class SiteRow(Protocol):
-    """Whole state of one arm's process: settings, gains, motion and results, one field each.
+    """Complete state of a site: settings, gains, motion and results, one field each.
 
-    One structured array element has these fields, which compiled code reads and writes. The
-    axis "shared" has one element for each coordinate that arms send each other. Users' compiled
-    control laws read these fields through `LawInput`, so fields of both have the same names.
-    The process of an arm is called a site.
+    Compiled code reads and writes these fields of a structured array element. The axis "shared"
+    has one element per coordinate that arms send to each other. Users' compiled control laws
+    read these fields through `LawInput`, so both use the same field names.
     """
 
     rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]
@@ -286,11 +285,11 @@ class SiteRow(Protocol):
 
 
 class LinkRow(Protocol):
-    """State of a network link, the one-way connection from another arm's process (the peer).
+    """State of a network link, the one-way connection from a peer to this arm.
 
-    It contains the sample in use, which is the newest state of the peer whose simulated delay
-    has passed, and the state of the random models of loss and delay. Before the first sample, q
-    and qd are the start pose of the peer and zero (law L7 of docs/develop/design.md).
+    It contains the sample in use (the newest sample of the peer whose simulated delay has
+    passed) and the state of the random models of loss and delay. Before the first sample, q is
+    the start pose of the peer and qd is zero (law L7 of docs/develop/design.md).
     """
 
     alpha: Annotated[
@@ -353,11 +352,10 @@ class LinkRow(Protocol):
 
 
 class SampleRow(Protocol):
-    """Message from another arm that waits until its simulated network delay has passed.
+    """A message from another arm, waiting for its simulated network delay to pass.
 
-    A message (sample) is the state that the other arm sends once per control period. A ring
-    buffer has one entry per control period of the receiver. The entry holds the newest message
-    that is first used in that period.
+    The ring buffer of a link has one entry per control period of the receiver. Each entry holds
+    the newest message that will first be used in that period.
     """
 
     tick: Annotated[int, Field("", "tick", "stamp of the sample; -1: no sample", "1 accept")]
@@ -367,10 +365,7 @@ class SampleRow(Protocol):
 
 
 class ArrivalRow(Protocol):
-    """Message from another arm that arrived since the previous control period.
-
-    A message (sample) is the state that the other arm sends once per control period.
-    """
+    """A message from another arm that arrived since the previous control period."""
 
     peer: Annotated[int, Field("", "", "index of the link", "input")]
     tick: Annotated[int, Field("", "tick", "stamp of the sample", "input")]
@@ -381,8 +376,7 @@ class ArrivalRow(Protocol):
 class ProgressRow(Protocol):
     """Progress of the simulation of one arm, and statistics of its motion.
 
-    The largest errors and speeds are collected for each interval of time, which is called a
-    bucket.
+    The largest errors and speeds are collected per time interval (bucket).
     """
 
     tick: Annotated[int, Field("", "tick", "next tick", "fused run")]
@@ -403,7 +397,7 @@ class ProgressRow(Protocol):
 class SumsRow(Protocol):
     """Sums over a simulated run of one arm, from which its metrics are computed at the end.
 
-    For example, the root mean square error follows from the sum of squared errors.
+    For example, the root mean square error is derived from the sum of squared errors.
     """
 
     first_environment: Annotated[
@@ -431,7 +425,7 @@ _KINDS = {int: "i8", float: "f8", np.uint64: "u8", Array: "f8"}
 def _read_fields(row: type) -> dict[str, Field]:
     """Reads the fields of a structured array from the class that describes them.
 
-    The fields have the order of the attributes of the class.
+    The fields are in the order of the class attributes.
 
     Args:
         row: The class, for example `SiteRow`.
@@ -451,7 +445,7 @@ FIELDS: dict[str, dict[str, Field]] = {
     "progress": _read_fields(ProgressRow),
     "sums": _read_fields(SumsRow),
 }
-"""The fields of each row, by the row's name and the field's name."""
+"""The fields of each row type, keyed by row name and field name."""
 
 
 def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
@@ -462,7 +456,7 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
         lengths: Length of each named axis.
 
     Returns:
-        The shape. () for a field that holds a single number.
+        The shape, or () for a scalar field.
     """
     if not field.shape:
         return ()
@@ -474,16 +468,15 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
 def row_dtype(
     row: str, lengths: Mapping[str, int], *, chain: bool = False
 ) -> np.dtype[np.void]:
-    """Returns the NumPy data type of an array whose elements are described by a class above.
+    """Returns the NumPy data type for one kind of row, such as the state of an arm or a link.
 
-    The classes describe, for example, the state of an arm or of a network link. The length of
-    each vector depends on the arm.
+    Vector lengths depend on the arm.
 
     Args:
-        row: Name of the kind in `FIELDS`, for example "site" or "link".
-        lengths: Number of joints, of shared coordinates and of dynamic parameters of the arm,
-            under the names "joints", "shared" and "parameters". Only the names that the fields
-            use are needed.
+        row: Key in `FIELDS`, for example "site" or "link".
+        lengths: Number of joints, shared coordinates and dynamic parameters of the arm, under
+            the keys "joints", "shared" and "parameters". Only the keys used by the fields are
+            required.
         chain: True to include the fields that only a chain of joints needs.
     """
     columns: list[Any] = [

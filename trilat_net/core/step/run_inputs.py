@@ -1,6 +1,6 @@
 """Stores the external inputs of a simulated run: arrivals, changes and operators' actions.
 
-A run that repeats a log receives the recorded inputs. A new run receives nothing except the
+A run that repeats a log is fed the recorded inputs. The only inputs of a new run are the
 actions of programs that move an arm.
 """
 
@@ -15,21 +15,19 @@ from .ticks import CoreChange
 from .vectors import Array
 
 _TARGET_COLUMN = 3
-"""First column of the target in an action. It follows grip, number and source."""
+"""First column of the target in an action, after grip, number and source."""
 
 
 class RunInputs(NamedTuple):
-    """All external inputs of a recorded run, with which the run can be repeated.
+    """All external inputs of a recorded run, from which the run can be repeated.
 
     Attributes:
-        feed: Ticks (control periods) in which samples of other sites arrived, and actions of
-            live operators (persons or programs that move an arm during the run). A site is a
-            process that runs one arm, and a sample is a state that a site sends.
-        changes: Changes of links or sites during the run, in order of time. Each entry contains
-            the tick before which the site applies the change, the index of the site, and the
-            change.
-        late_ns: Largest time from the stamp of a sample to its arrival, in ns. The loop needs
-            it to decide how long samples are stored.
+        feed: Ticks in which samples of other sites arrived, and actions of live operators.
+        changes: Changes of links or sites during the run, in chronological order. Each entry
+            contains the tick before which the site applies the change, the index of the site,
+            and the change.
+        late_ns: Longest time from the time stamp of a sample to its arrival, in ns, which
+            determines how long samples must be stored.
     """
 
     feed: ReplayedInputs
@@ -41,14 +39,14 @@ class RunInputs(NamedTuple):
         """Returns the inputs of a run that receives nothing from outside.
 
         In such a run, every sample arrives promptly, in the first tick after it was sent. No
-        setting changes, and no live operator moves an arm. The delays that the setup states for
-        the links are still applied, by the receivers.
+        setting changes, and no live operator moves an arm. Link delays from the setup still
+        apply, because they are simulated by the receivers.
 
         Args:
             sites: Number of sites.
         """
         most_peers = max(sites - 1, 1)
-        # Arrays for 0 ticks tell the compiled loop that nothing was recorded, see
+        # To the compiled loop, arrays for 0 ticks mean that nothing was recorded, see
         # `ReplayedInputs`.
         feed = ReplayedInputs(
             first=np.zeros((sites, most_peers, 0), np.int64),
@@ -61,12 +59,12 @@ class RunInputs(NamedTuple):
     def with_hands(
         self, setups: Sequence[SiteSetup], sites: Collection[int], ticks: int
     ) -> "RunInputs":
-        """Returns these inputs with memory for the actions of live operators.
+        """Returns these inputs with memory allocated for the actions of live operators.
 
         Args:
             setups: Setups of all sites.
             sites: Indices of the sites with a live operator.
-            ticks: Number of ticks for which there is memory.
+            ticks: Number of ticks to allocate memory for.
         """
         if not sites:
             return self
@@ -80,10 +78,10 @@ class RunInputs(NamedTuple):
         return self._replace(feed=feed)
 
     def with_ticks(self, ticks: int) -> "RunInputs":
-        """Returns these inputs with memory for more actions of live operators.
+        """Returns these inputs with more memory for the actions of live operators.
 
         Args:
-            ticks: Number of ticks for which there is memory, not less than before.
+            ticks: Number of ticks to allocate memory for, not less than before.
         """
         sites, old_ticks, columns = self.feed.hands.shape
         actions = np.zeros((sites, ticks, columns))
@@ -91,17 +89,16 @@ class RunInputs(NamedTuple):
         return self._replace(feed=self.feed._replace(hands=actions))
 
     def write_actions(self, i: int, first_tick: int, actions: Array) -> None:
-        """Converts the actions of an operator to the form that the compiled loop reads.
+        """Stores the actions of an operator in the form that the compiled loop reads.
 
-        A live operator is a person or program that moves the arm of a site. It prescribes m
-        target coordinates. The two forms of an action have these columns:
+        A live operator prescribes m target coordinates. The columns of the two forms are:
 
-        - Action of the operator (`HandInForce`): firmness of the grip; number of the operator's
+        - Action of the operator (`HandInForce`): grip firmness; number of the operator's
           message; source of the message; target (m columns); velocity of the target (m
           columns).
-        - Action in the feed (`ReplayedInputs.hands`): firmness of the grip; target (M columns);
-          the position that the target would reach after one second, the sum of target and
-          velocity (M columns). M is the largest m of all sites. The columns beyond m stay zero.
+        - Action in the feed (`ReplayedInputs.hands`): grip firmness; target (M columns); target
+          one second later, i.e. the sum of target and velocity (M columns). M is the largest m
+          of all sites. Columns beyond m stay zero.
 
         Args:
             i: Index of the site.
@@ -122,10 +119,10 @@ class RunInputs(NamedTuple):
 
 
 def _count_coordinates(numbers: int) -> int:
-    """Returns how many coordinates a person or program may command to move an arm.
+    """Returns the number of coordinates that a person or program commands to move an arm.
 
     Args:
-        numbers: Count of the numbers of an action: grip, number and source, followed by the
-            target and the velocity of each coordinate, see `HandInForce`.
+        numbers: Length of an action: grip, number and source, followed by the target and the
+            velocity of each coordinate, see `HandInForce`.
     """
     return (numbers - _TARGET_COLUMN) // 2

@@ -1,10 +1,10 @@
 """Defines the state of a simulated run, which can be copied to another run.
 
-The growth of a small difference between two runs of the same scenario shows whether the runs
-are stable.
+How a small difference between two runs of the same scenario grows shows whether the runs are
+stable.
 
 Invariant:
-    - Numbers that are equal in both runs do not change.
+    - Values that are equal in both runs stay equal when the difference is scaled.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,21 +22,20 @@ from .vectors import Array, IntArray, RowArray
 class RunMemory(NamedTuple):
     """All arrays of a simulated run, for modules that compute several runs side by side.
 
-    N is the number of sites (processes that run one arm), and P the largest number of peers
-    (other sites) from which a site receives samples (sent states).
+    N is the number of sites, and P the largest number of peers of any site.
 
     Attributes:
         tables: Arrays of all sites.
         progress: Progress of each site, shape (N,), see `ProgressRow`.
         next_samples: Next sample to accept, for each site and peer, shape (N, P).
-        sent: Latest records (results of control periods) of the sites.
+        sent: Latest records of the sites.
         peaks: Peaks in intervals of 50 ms, see `run_until`.
         sums: Sums over the records, shape (N,), see `SumsRow`.
         settled_rad: Position error below which an arm counts as settled, rad.
         laws: Gains and memory of compiled laws that are not part of the kernel. None if no site
             has such a law.
-        compiled_laws: The compiled laws themselves, by the index of their site.
-        has_plain_law: True if a site has a law in plain Python.
+        compiled_laws: The compiled laws themselves, keyed by site index.
+        has_plain_law: True if any site has a law in plain Python.
         feed: Inputs of a recorded run.
     """
 
@@ -56,12 +55,12 @@ class RunMemory(NamedTuple):
 class RunState:
     """The complete state of a simulated run: all arrays that change, viewed as 64-bit integers.
 
-    With this object, the state of a run can be copied to another run, or moved closer to that
-    of another run. The views share the memory of the run, so a change of the object changes the
-    run. Integers are used because equal integers mean equal bits.
+    Used to copy the state of one run to another, or to move it closer to the state of another
+    run. The views share memory with the run, so changing this object changes the run. Integer
+    views are used because equal integers mean equal bits.
 
     Args:
-        arrays: The arrays that contain the state. Their memory is shared, not copied.
+        arrays: Arrays that contain the state. Their memory is shared, not copied.
     """
 
     def __init__(self, arrays: Sequence[NDArray[np.generic]]) -> None:
@@ -71,7 +70,7 @@ class RunState:
             if not array.size:
                 continue
             flat = array.reshape(-1).view(np.int64)
-            # If `reshape` had made a copy, changes would not reach the run.
+            # If `reshape` had made a copy, changing the views would not change the run.
             assert np.shares_memory(flat, array)
             self._bits.append(flat)
             self._floats.append(np.tile(self.mark_floats(array.dtype), array.size))
@@ -79,13 +78,13 @@ class RunState:
     def scale_difference(self, other: "RunState", factor: float) -> None:
         """Multiplies the difference between this state and another state by a factor.
 
-        Every floating-point number x of this state becomes x_other + factor (x - x_other). With
-        the factor 0, this state becomes an exact copy of the other state. Integers, and results
-        that would not be finite, are copied from the other state.
+        Every floating-point value x of this state becomes x_other + factor (x - x_other). With
+        a factor of 0, this state becomes an exact copy of the other. Integers, and results that
+        would not be finite, are copied from the other state.
 
         Args:
-            other: State of another run of the same scenario. It does not change.
-            factor: Number by which the difference is multiplied. It has no unit.
+            other: State of another run of the same scenario. It is not changed.
+            factor: Dimensionless scale factor.
         """
         arrays = zip(self._bits, other._bits, self._floats, strict=True)
         for bits, other_bits, is_float in arrays:
@@ -93,7 +92,7 @@ class RunState:
                 bits[:] = other_bits
                 continue
 
-            # Only numbers that differ are computed. Rounding would change the others.
+            # Only compute values that differ, because rounding would change the others.
             changed = np.flatnonzero((bits != other_bits) & is_float)
             x = bits.view(np.float64)[changed]
             y = other_bits.view(np.float64)[changed]
@@ -102,16 +101,14 @@ class RunState:
 
     @staticmethod
     def mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
-        """Marks which of the 8-byte numbers in an element of an array are floats.
+        """Marks which 8-byte words in an array element are floats.
 
         For a structured type with the fields x (two float64) and count (int64), the result is
-        [True, True, False]. A small disturbance of a run scales only the floats
-        (`scale_differences`). The size of every field of the kernel is a multiple of eight
-        bytes.
+        [True, True, False]. Scaling a small perturbation of a run affects only the floats
+        (`scale_differences`). The size of every kernel field is a multiple of eight bytes.
 
         Args:
-            dtype: Data type of the element. It may have fields, which may have fields
-                themselves.
+            dtype: Data type of the element, which may have nested fields.
         """
         if dtype.fields is None:
             return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
@@ -126,12 +123,12 @@ class RunState:
     def scale_differences(x: Array, y: Array, factor: float) -> Array:
         """Scales the difference between the states of two simulations: y + factor (x - y).
 
-        With a factor below 1, for example, the first state moves closer to the second.
+        A factor below 1 moves the first state closer to the second.
 
         Args:
-            x: Numbers of a run.
-            y: The same numbers of another run. They replace results that would not be finite.
-            factor: The factor.
+            x: Values from one run.
+            y: The same values from another run. They replace results that would not be finite.
+            factor: Scale factor.
         """
         mixed: Array = y + factor * (x - y)
         return np.where(np.isfinite(mixed), mixed, y)

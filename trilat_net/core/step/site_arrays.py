@@ -1,19 +1,19 @@
 """Creates the arrays that hold the state of a running arm, and enlarges them during a run.
 
-The arrays contain the state of an arm and of its control law (`SiteRow`), and the state of each
-network link (`LinkRow`) over which the arm receives samples, the states of other arms. A ring
-buffer per link, called calendar, keeps samples until their simulated delay has passed. It is
-enlarged when a delay grows during a run.
+The arrays contain the state of an arm and its control law (`SiteRow`), and of each network link
+over which the arm receives samples (`LinkRow`). Each link has a ring buffer (calendar) that
+holds samples until their simulated delay has passed. The buffer is enlarged when the delay
+grows during a run.
 
-Structured arrays are used because they are cheap to pass to compiled code, and because their
-fields can have the same names as the symbols in the equations.
+Structured arrays are cheap to pass to compiled code, and their fields can be named after the
+symbols in the equations.
 
 Invariant:
     - The compiled code of a control period reads and writes nothing but these arrays and
       `TickBuffers`.
     - Two arms with equal setups have equal arrays.
-    - The links of an arm take at most `MAX_LINKS_BYTES` of memory beyond what the delays in the
-      setup need.
+    - The links of an arm use at most `MAX_LINKS_BYTES` of memory in addition to what the delays
+      in the setup require.
 """
 
 from collections.abc import Sequence
@@ -43,15 +43,15 @@ from .vectors import Array, IntArray, Points, Row, RowArray
 
 _OTHER_GAINS = ("law", "theta_hat0", "absolute")
 _GAINS = tuple(name for name in Gains._fields if name not in _OTHER_GAINS)
-"""Constant gains, with the names of the site's fields. theta_hat0 is stored as `theta_hat`."""
+"""Constant gains, named like the fields of the site. theta_hat0 is stored as `theta_hat`."""
 
 
 @cache
 def site_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Returns the NumPy structured data type for the whole state of one arm's process (site).
+    """Returns the NumPy structured data type that holds the complete state of a site.
 
-    Settings, gains, motion and results are its fields, which `SiteRow` lists. One array element
-    holds everything that the compiled control loop reads and writes about the arm.
+    `SiteRow` lists its fields, which are the settings, gains, motion and results. One array
+    element holds everything that the compiled control loop reads and writes about the arm.
 
     Args:
         layout: Lengths of the site's vectors.
@@ -66,23 +66,24 @@ def arrival_dtype(shared: int) -> np.dtype[np.void]:
     `ArrivalRow` lists its fields: the sending arm, the control period, and the motion.
 
     Args:
-        shared: Number of coordinates that sites share, the length of the sample's vectors.
+        shared: Number of coordinates that sites share, which is the length of the sample's
+            vectors.
     """
     return row_dtype("arrival", {"shared": shared})
 
 
 class SiteArrays(NamedTuple):
-    """All arrays that the compiled control loop of one arm's process (site) reads and writes.
+    """All arrays that the compiled control loop of a site reads and writes.
 
     For a simulation of several arms, the arrays of all sites are stacked along an additional
-    first axis.
+    leading axis.
 
     Attributes:
         site: State and constants, shape (1,), see `site_dtype`.
         links: One row per peer, shape (P,), see `link_dtype`.
-        models: The models of the links' channels, shape (P, M), LINK_MODEL_DTYPE.
-        dues: Due times of the links' newest samples, shape (P, D), ns; see `LinkArrays`.
-        calendars: The links' calendars, shape (P, pages), see `sample_dtype`.
+        models: Delay and loss models of the links, shape (P, M), LINK_MODEL_DTYPE.
+        dues: Due times of the newest samples on the links, shape (P, D), ns; see `LinkArrays`.
+        calendars: Calendars of the links, shape (P, pages), see `sample_dtype`.
         points: Traces and outages, shape (n, 2); stacked sites share one table.
         ramps: Changes of the dominance factors, shape (R, RAMP_COLUMNS + P).
         actors: Operators and environments, shape (A,), see `torque_source_dtype`.
@@ -90,7 +91,7 @@ class SiteArrays(NamedTuple):
             sites share one table.
         chain: The joints of a chain, shape (n,), see `chain_dtype`. None for the planar
             two-link arm.
-        channel: The values that the peers' laws send to a user's law, per peer. None if the
+        channel: Values that the peers' laws send to a user's law, one row per peer. None if the
             kernel computes the law.
     """
 
@@ -116,18 +117,17 @@ class SiteArrays(NamedTuple):
         *,
         plugged: bool = False,
     ) -> "SiteArrays":
-        """Creates all arrays of an arm's process (site), as before its first control period.
+        """Creates all arrays of a site, in their state before the first control period.
 
         Args:
             setup: Setup of the site.
-            spare: Numbers of free rows for changes during the run: first for changes of each
-                link's delay model, then for changes of the weights with which the site follows
-                the other sites.
+            spare: Number of free rows for changes during the run, first for changes of each
+                link's delay model, then for changes of the dominance factors.
             pages: Number of samples that can wait on each link, which is also the number of
-                delivery times that each link stores. 0 to derive both numbers from the setup.
-            layout: Lengths of the vectors in the arrays, if they are larger than this site
+                delivery times stored per link. 0 to derive both from the setup.
+            layout: Lengths of the vectors in the arrays, if they must be larger than this site
                 needs.
-            plugged: True to include the arrays of a user's control law, even if this site has
+            plugged: True to include the arrays for a user's control law, even if this site has
                 none.
         """
         links = setup.links
@@ -173,16 +173,15 @@ class SiteArrays(NamedTuple):
         changes: Sequence[CoreChange] = (),
         late_ns: int = 0,
     ) -> "SiteArrays":
-        """Creates the arrays for a simulation of several sites, stacked along a first axis.
+        """Creates the arrays for a simulation of several sites, stacked along a leading axis.
 
-        A site is a process that runs one arm. If the arrays of a site are shorter than those of
-        another site, they are padded with rows that are never read. The ring buffers for
-        delayed samples (states of other sites) are long enough for all delays.
+        Arrays that are shorter than those of another site are padded with rows that are never
+        read. The ring buffers for delayed samples are large enough for all delays.
 
         Args:
             setups: Setups of the sites.
-            changes: Changes during the run. The tables of each link, and of the weights with
-                which each site follows the others, have free rows for all changes.
+            changes: Changes during the run. The tables of link models and dominance factors get
+                enough free rows for all of them.
             late_ns: Longest time by which a sample may arrive after its delivery time, ns.
         """
         longest_us = 0
@@ -228,8 +227,8 @@ class SiteArrays(NamedTuple):
     def select(self, i: int, layout: Layout) -> "SiteArrays":
         """Returns the arrays of one arm in a simulation of several arms, without copying.
 
-        Vectors may be longer than this arm needs, because the vectors of all arms are equally
-        long.
+        Vectors may be longer than this arm needs, because they have the same length for all
+        arms.
 
         Args:
             i: Index of the site.
@@ -257,13 +256,13 @@ class SiteArrays(NamedTuple):
         )
 
     def widen_calendars(self, k: int, pages: int) -> "SiteArrays":
-        """Enlarges the ring buffers in which messages wait for their simulated delay to pass.
+        """Enlarges the calendars, the ring buffers that hold delayed messages.
 
-        All waiting messages are kept. The buffers are called calendars.
+        All waiting messages are kept.
 
         Args:
-            k: The next control period of the site.
-            pages: New number of entries of each buffer, a power of two.
+            k: Next tick of the site.
+            pages: New number of entries per buffer, a power of two.
 
         Returns:
             New arrays with the larger buffers.
@@ -284,23 +283,23 @@ class SiteArrays(NamedTuple):
         return self._replace(calendars=calendars, channel=channel)
 
     def apply_change(self, change: CoreChange, t_ns: int) -> None:
-        """Applies a change from outside to a running site, the process that runs one arm.
+        """Applies an external change to a running site.
 
-        There are four kinds of changes:
+        There are four kinds of change:
 
-        - The message that the site missed ticks, the periods of its control loop. Their number
-          is stored until the next tick.
-        - An order, for example to stop the arm. The next tick carries it out. If several orders
-          arrive before this tick, the order with the highest number counts, see `LifeOrder`.
-        - A new model of the delay and loss of a link. It is added to the table of the link's
-          models, and applies from its start time.
-        - A ramp of the dominance factors, the weights with which the arm follows the other
-          arms. It is added to the table of ramps, after old ramps have been removed.
+        - A notification that the site missed ticks. Their number is stored until the next tick.
+        - An order, for example to stop the arm. It is carried out at the next tick. If several
+          orders arrive before then, the one with the highest number takes precedence; see
+          `LifeOrder`.
+        - A new delay and loss model for a link. It is added to the link's table of models, and
+          applies from its start time.
+        - A ramp of the dominance factors. It is added to the table of ramps, after old ramps
+          have been removed.
 
         Args:
             change: The change.
-            t_ns: Present time in ns since the start of the session. The site computes no more
-                control periods before this time.
+            t_ns: Current time in ns since the start of the session. The site will not compute
+                control periods before this time any more.
 
         Raises:
             ValueError: A table has no free row for the change.
@@ -330,15 +329,14 @@ class SiteArrays(NamedTuple):
     def count_pages(setup: SiteSetup) -> int:
         """Computes how many messages must be able to wait on each network link of an arm.
 
-        A message (the state of another arm) waits until its simulated delay has passed. The
-        result follows from the longest delay, and from the time `_NEAR_NS` by which the clock
-        of a sender may be ahead.
+        A message waits until its simulated delay has passed. The number depends on the longest
+        delay, and on how far the sender's clock may be ahead (`_NEAR_NS`).
 
         Args:
             setup: Setup of the site.
 
         Returns:
-            The number of entries of the ring buffer of a link, a power of two.
+            The number of entries in the ring buffer of each link, a power of two.
         """
         delays_us = [max_delay_us(link.models, link.traces) for link in setup.links]
         longest_us = max(delays_us)
@@ -346,15 +344,15 @@ class SiteArrays(NamedTuple):
 
     @staticmethod
     def count_link_bytes(setup: SiteSetup, pages: int | None = None) -> int:
-        """Returns the memory that the network links of an arm take, in bytes.
+        """Returns the memory used by the network links of an arm, in bytes.
 
-        The ring buffers in which delayed messages wait take most of the memory. `CalendarSizer`
+        Most of it is used by the ring buffers in which delayed messages wait. `CalendarSizer`
         uses the result to limit their length.
 
         Args:
             setup: Setup of the arm.
-            pages: Number of samples that can wait in the ring buffer of each link. By default
-                it is the number that the delays need.
+            pages: Number of samples that can wait in the ring buffer of each link. Defaults to
+                the number required by the delays.
         """
         if pages is None:
             pages = SiteArrays.count_pages(setup)
@@ -369,19 +367,19 @@ class SiteArrays(NamedTuple):
 
 
 class TickBuffers(NamedTuple):
-    """Arrays for the input and output of one control period: received messages and results.
+    """Input and output arrays for one control period: received messages and results.
 
-    They are created once and reused in every period, because allocation takes time. A message
-    (sample) is the state of another arm, with m coordinates.
+    They are created once and reused in every period, because allocation takes time. A sample
+    contains m coordinates.
 
     Attributes:
         arrivals: Samples that arrived since the previous period, shape (MAX_ARRIVALS,), see
             `arrival_dtype`.
-        forces: External torques or forces on the arms of the senders, N m or N, shape
-            (MAX_ARRIVALS, m).
-        sent: Further values that the control laws of the senders sent, shape (MAX_ARRIVALS, C)
-            for at most C values per sample.
-        record: Receives the floating-point numbers of the record, see `Layout.columns`.
+        forces: External torques or forces on the senders' arms, N m or N, shape (MAX_ARRIVALS,
+            m).
+        sent: Further values sent by the senders' control laws, shape (MAX_ARRIVALS, C) for at
+            most C values per sample.
+        record: Output array for the floating-point values of the record, see `Layout.columns`.
     """
 
     arrivals: RowArray
@@ -393,10 +391,10 @@ class TickBuffers(NamedTuple):
     def build(cls, setup: SiteSetup) -> "TickBuffers":
         """Creates the arrays for the received messages and the results of a control period.
 
-        An arm's process creates them once and reuses them in every period.
+        A site creates them once and reuses them in every period.
 
         Args:
-            setup: Setup of the site, which determines the lengths of vectors.
+            setup: Setup of the site, which determines the vector lengths.
         """
         layout = setup.layout
         largest_received = 0
@@ -414,11 +412,11 @@ def _count_kept_dues(setup: SiteSetup) -> int:
     """Returns the number of messages whose delivery times a link stores.
 
     A delivery time (due time) is stored for as long as its message may still arrive, late or as
-    a duplicate. The longest possible delay, and the largest time by which the sender's clock
-    may be ahead of the receiver's, bound this time.
+    a duplicate. This time is bounded by the longest possible delay and by how far the sender's
+    clock may be ahead of the receiver's.
 
     Args:
-        setup: Setup of the site. The fastest loop on either end determines the number.
+        setup: Setup of the site. The number depends on the fastest loop at either end.
     """
     peer_rates_hz = [link.rate_hz for link in setup.links]
     fastest_hz = max(setup.rate_hz, *peer_rates_hz)
@@ -429,15 +427,14 @@ def _count_kept_dues(setup: SiteSetup) -> int:
 class CalendarSizer:
     """Enlarges the ring buffers of delayed samples when a sample arrives that does not fit.
 
-    A sample is the state of a peer, the process of another arm. It waits until its simulated
-    delay has passed. A buffer is too short if the delays have become longer, or if the clock of
-    the peer is far ahead. The buffers never take more memory than `MAX_LINKS_BYTES`, or than
-    the delays in the setup need. A sample that still does not fit is rejected later.
+    Samples wait in a buffer until their simulated delay has passed. A buffer is too short if
+    delays have increased, or if the peer's clock is far ahead. The buffers never use more
+    memory than `MAX_LINKS_BYTES`, or than the delays in the setup require. A sample that still
+    does not fit is rejected later.
 
     Attributes:
-        newest: For each peer the number of the newest sample that is known to fit now and
-            later.
-        most_pages: Largest number of entries of a buffer.
+        newest: For each peer, the number of the newest sample known to fit now and later.
+        most_pages: Largest number of entries per buffer.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -453,18 +450,18 @@ class CalendarSizer:
             self.most_pages *= 2
 
     def clear(self) -> None:
-        """Forgets which messages are known to fit into the ring buffers of the links.
+        """Discards the knowledge of which messages fit into the ring buffers of the links.
 
-        The next message of each sender is then checked again.
+        The next message of each sender will be checked again.
         """
         self.newest = [-1] * len(self.newest)
 
     def add_model(self, peer: int, model: LinkModel) -> None:
-        """Takes note of a new delay model of a link, to reserve room for longer delays.
+        """Takes a new delay model of a link into account, to reserve space for longer delays.
 
         Args:
             peer: Index of the sender at the other end of the link.
-            model: New model of the link's delays.
+            model: New delay model of the link.
         """
         longest_us = max_delay_us([model], [None])
         self._delay_us[peer] = max(self._delay_us[peer], longest_us)
@@ -473,12 +470,12 @@ class CalendarSizer:
     def list_rooms(self) -> list[tuple[int, int]]:
         """Returns how long received samples may wait in their ring buffers, for each sender.
 
-        A sample is the state of another arm. The compiled loop of `recorded_ticks` needs these
-        numbers to check whether a sample fits into its buffer.
+        The compiled loop of `recorded_ticks` uses this to check whether a sample fits into its
+        buffer.
 
         Returns:
-            For each sender its entry of `newest`, and how many ticks (control periods) a sample
-            waits at most.
+            For each sender, its entry of `newest` and the largest number of ticks that a sample
+            waits.
         """
         longest_waits = []
         for delay_us in self._delay_us:
@@ -487,29 +484,28 @@ class CalendarSizer:
         return list(zip(self.newest, longest_waits, strict=True))
 
     def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
-        """Makes sure that a sample fits into the ring buffer of its link.
+        """Ensures that a sample fits into the ring buffer of its link.
 
-        A sample is the state that a peer (another arm's process) sends in one of its ticks, the
-        periods of its control loop. The sample waits in the buffer until its simulated delay
-        has passed. The buffer has one entry, called page, for the present tick and each later
-        tick of the receiver. The sample fits if the last tick in which it may come into use has
-        a page. This tick is at most `ahead` + `longest_wait` ticks away: the sample was sent
-        `ahead` ticks after the present tick (negative for an earlier sample), and then waits
-        for at most `longest_wait` ticks.
+        The sample waits in the buffer until its simulated delay has passed. The buffer has one
+        entry (page) for the current tick and one for each later tick of the receiver. The
+        sample fits if there is a page for the last tick in which it may first be used. This
+        tick is at most `ahead` + `longest_wait` ticks away: the sample was sent `ahead` ticks
+        after the current tick (negative for an earlier sample), and then waits for at most
+        `longest_wait` ticks.
 
-        If the clock of the peer is too far ahead, the buffer is not enlarged, and the sample is
-        rejected later. Otherwise `newest` is updated: it is the newest sample of the peer that
-        fits into the buffer as it is now. Samples up to `newest` need no call of this method.
+        If the peer's clock is too far ahead, the buffer is not enlarged, and the sample is
+        rejected later. Otherwise, `newest` is set to the newest sample of the peer that fits
+        into the buffer at its current size. Samples up to `newest` need no call of this method.
 
         Args:
-            arrays: Arrays of the site, the process that receives the sample.
-            k: Present tick of the site.
+            arrays: Arrays of the receiving site.
+            k: Current tick of the site.
             peer: Index of the peer.
-            tick: Tick of the peer in which it sent the sample.
+            tick: Tick in which the peer sent the sample.
 
         Returns:
             The same arrays if the sample fits, if it will be rejected, or if the buffers have
-            their largest size. Otherwise arrays with larger buffers.
+            already reached their largest size. Otherwise, arrays with larger buffers.
         """
         rate_hz = self._rate_hz
         peer_hz = self._peer_hz[peer]
@@ -522,7 +518,7 @@ class CalendarSizer:
         needed = ahead + longest_wait
         pages = arrays.calendars.shape[1]
         if needed > pages and pages < self.most_pages:
-            # The number of pages is a power of two, so that a modulo is a mask of bits.
+            # The number of pages is a power of two, so that a modulo is a bit mask.
             next_power_of_two = 1 << needed.bit_length()
             pages = min(next_power_of_two, self.most_pages)
             # Samples of missed ticks still wait in the pages of those ticks.
@@ -534,19 +530,18 @@ class CalendarSizer:
 
 
 def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
-    """Adds a planned change of the weights with which an arm follows the other arms.
+    """Adds a planned change of the dominance factors of an arm.
 
-    The changes are stored in a table, which is sorted by their start times.
+    The changes are stored in a table sorted by start time.
 
     Args:
-        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
-            row.
+        arrays: Arrays of the site, whose table must have a free row.
         ramp: The change, a ramp in time.
     """
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
-    # Row 0 holds the weights before the first change, and stays first.
+    # Row 0 holds the factors before the first change, and stays first.
     starts_ns = ramps[1:count, 0]
     index = 1 + int(np.searchsorted(starts_ns, ramp.start_ns, side="right"))
     later_ramps = ramps[index:count].copy()
@@ -558,13 +553,12 @@ def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     """Adds a planned change of a network link's delay and loss.
 
-    The changes are stored in a table, which is sorted by the time from which each applies.
+    The changes are stored in a table sorted by start time.
 
     Args:
-        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
-            row.
+        arrays: Arrays of the site, whose table must have a free row.
         peer: Index of the site at the other end of the link.
-        model: Model of delay and loss, with the time from which it applies.
+        model: Delay and loss model, including its start time.
     """
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
@@ -576,8 +570,7 @@ def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     models[index + 1 : count + 1] = later_models
     models[index] = model
     link.models = count + 1
-    # The model in force moves down one row. Samples that are scheduled already keep their
-    # times.
+    # The model in force moves down one row. Samples already scheduled keep their times.
     if link.model >= index:
         link.model += 1
 
@@ -585,18 +578,17 @@ def _add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
 MAX_CHANGES = 4096
 """Largest number of changes of one link in addition to those in the scenario."""
 MAX_RAMPS = 256
-"""Largest number of waiting changes of the dominance factors that are not in the scenario.
+"""Largest number of pending changes of the dominance factors that are not in the scenario.
 
-A run may have any number of changes, because changes that have begun are removed, see
-`fold_ramps`.
+A run may have any number of changes in total, because changes that have started are removed,
+see `fold_ramps`.
 """
 
 
 _NEAR_NS = NS_PER_S // 4
-"""Time by which senders may be ahead of a slightly late receiver without a larger buffer, ns.
-"""
+"""How far senders may be ahead of a slightly late receiver without a larger buffer, ns."""
 MAX_LINKS_BYTES = 64 << 20
-"""Largest memory of a site's links beyond what their delays need, bytes."""
+"""Largest memory of a site's links in addition to what their delays require, bytes."""
 _SLACK = 4
 """Reserve in ticks, because a sample is scheduled up to two ticks before it is stored."""
 _NEVER_SAMPLED = 2
@@ -604,11 +596,11 @@ _NEVER_SAMPLED = 2
 
 
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
-    """Shifts the indices of table rows, because the tables of all sites are joined into one.
+    """Shifts table row indices to prepare for joining the tables of all sites into one.
 
-    Each site (one arm) has a table with the points of delay traces and outages, and one with
-    the recorded torques of operators. `SiteArrays.stack` joins them for a simulation of all
-    sites, so that the rows of the second site begin after those of the first.
+    Each site has a table with the points of delay traces and outages, and one with the recorded
+    torques of operators. `SiteArrays.stack` joins them for a simulation of all sites, placing
+    the rows of the second site after those of the first.
 
     Args:
         sites: Arrays of the sites, in the order of the joined tables. Their indices are
@@ -629,24 +621,23 @@ def _stack_channels(
 ) -> ChannelArrays:
     """Stacks the arrays for the values that control laws send, for several sites.
 
-    A site is the process that runs one arm, and its peers are the other sites. The law of a
-    peer sends A values to all sites, and E values to each of them. A single site receives only
-    the A + E values that are meant for it. In a simulation of all sites, it reads the record of
-    the peer, which contains the values for all of its receivers:
+    The law of a peer sends A values to all sites, and E values to each of them individually. A
+    single site receives only the A + E values intended for it. In a simulation of all sites, it
+    reads the record of the peer, which contains the values for all of its receivers:
 
         a single site:  A to all | E to this site
         record:         A to all | E to receiver 0 | E to receiver 1 | ...
 
-    Therefore, for values that are sent to each site separately, the column increases by E for
-    each receiver before this site.
+    The column of a value sent to each site individually therefore increases by E for each
+    receiver that precedes this site.
 
     Args:
         setups: Setups of the sites.
-        channels: Arrays of each site. `columns` contains for each peer the index of each number
+        channels: Arrays of each site. For each peer, `columns` contains the index of each value
             that the law of the site reads, or -1. It is changed in place.
 
     Returns:
-        The arrays with a first axis for the site, filled up to equal lengths.
+        The arrays with a leading axis for the site, padded to equal length.
     """
     for setup, channel in zip(setups, channels, strict=True):
         for link, columns in zip(setup.links, channel.columns, strict=True):
@@ -659,17 +650,16 @@ def _stack_channels(
     received = _stack_padded([channel.received for channel in channels])
     columns = _stack_padded([channel.columns for channel in channels])
     for channel, padded in zip(channels, columns, strict=True):
-        # Zeros would mean column 0, so the padding is -1, which stands for a value that is not
-        # sent.
+        # Zeros would mean column 0, so pad with -1, which stands for a value that is not sent.
         count = channel.columns.shape[1]
         padded[:, count:] = -1
     return ChannelArrays(waiting, received, columns)
 
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Stacks arrays of different lengths along a new first axis, filled up with zeros.
+    """Stacks arrays of different lengths along a new leading axis, padded with zeros.
 
-    Example: arrays of the shapes (3,) and (5,) become one array of shape (2, 5).
+    Example: arrays of shapes (3,) and (5,) become one array of shape (2, 5).
     """
     shapes = [array.shape for array in arrays]
     largest_shape = [max(lengths) for lengths in zip(*shapes, strict=True)]
@@ -684,12 +674,12 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
-    """Creates the state of an arm's process (site) before its first control period.
+    """Creates the state of a site before its first control period.
 
     Args:
         setup: Setup of the site.
-        layout: Lengths of the vectors of the result. They may be longer than the site needs;
-            the further numbers stay zero.
+        layout: Lengths of the vectors in the result. They may be longer than the site needs, in
+            which case the extra entries stay zero.
     """
     site = np.zeros(1, site_dtype(layout))
     s: Row = site[0]
@@ -729,7 +719,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.singular_value = task.singular_value
         s.axes[: site_layout.shared] = task.axes
         s.posture[: site_layout.joints] = task.posture or setup.q0
-    # Creating a view of each field would take longer than copying the numbers.
+    # Creating a view of each field would take longer than copying the values.
     floats = site.view(np.float64)
     places = _find_places(layout, site_layout)
     for name, numbers in _list_vectors(setup).items():
@@ -739,7 +729,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
 
 @cache
 def _find_places(layout: Layout, site_layout: Layout) -> dict[str, slice]:
-    """Returns the position of each vector among all numbers of a site's row, by its name.
+    """Returns the position of each vector among the values of a site's row, keyed by name.
 
     Args:
         layout: Layout of the row.
@@ -758,10 +748,10 @@ def _find_places(layout: Layout, site_layout: Layout) -> dict[str, slice]:
 
 
 def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
-    """Returns gains, limits, and the start of the motion, by the names of their fields.
+    """Returns gains, limits and the initial motion, keyed by field name.
 
     The estimate of the arm's parameters starts with the known parameters if the control law
-    assumes that they are known. Otherwise it starts with the estimate of the setup.
+    assumes that they are known. Otherwise, it starts with the estimate in the setup.
     """
     gains = setup.gains
     vectors: dict[str, Any] = {name: getattr(gains, name) for name in _GAINS}
@@ -781,10 +771,10 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
 
 
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
-    """Creates the arrays for the values that the control laws of other arms send.
+    """Creates the arrays for the values sent by the control laws of other arms.
 
-    Some control laws send values besides the motion of the arm, for example energies. The
-    arrays are empty for all other laws.
+    Some control laws send values in addition to the motion of the arm, for example energies.
+    For all other laws, the arrays are empty.
 
     Args:
         setup: Setup of the site that receives the values.
@@ -809,13 +799,13 @@ def _build_links(
 
     Args:
         links: Setups of the links.
-        spare: Number of free rows for later changes of the delay model of each link.
-        shared: Number of coordinates of a sample, the state that another arm sends.
+        spare: Number of free rows per link for later changes of its delay model.
+        shared: Number of coordinates in a sample.
 
     Returns:
-        The state of each link, shape (P,). The models of delay and loss, shape (P, M). The
-        points of all delay traces and then of all outages, to which the models and the links
-        refer by the index of their first row.
+        The state of each link, shape (P,), the delay and loss models, shape (P, M), and the
+        points of all delay traces followed by those of all outages. Models and links refer to
+        the points by the index of their first row.
     """
     most_models = max(len(link.models) for link in links)
     model_rows = most_models + spare

@@ -1,11 +1,10 @@
-"""Defines the setup of an arm: all numbers and names that are needed to run its control loop.
+"""Defines the setup of a site: everything needed to run the control loop of its arm.
 
-The setup is derived from a scenario, the file that describes an experiment. In contrast to the
-scenario, the setup has no missing values, and refers to other arms by index instead of name. An
-arm with its control loop is called a site.
+The setup is derived from a scenario. Unlike the scenario, it has no missing values, and it
+refers to other arms by index instead of by name.
 
 Invariant:
-    - All numbers that a site computes depend only on its setup and on the inputs of its control
+    - Everything that a site computes depends only on its setup and on the inputs of its control
       periods.
 """
 
@@ -29,11 +28,11 @@ from .vectors import Array, Points, Vector
 
 
 class Scheme(IntEnum):
-    """Method by which the continuous control law is converted to a discrete one.
+    """Method used to discretise the continuous control law.
 
     SECOND_ORDER extrapolates the torque to the middle of the control period, and updates the
-    parameter estimate by the trapezoid rule. DIGITAL uses a zero-order hold and the forward
-    Euler rule, as a plain digital controller does.
+    parameter estimate with the trapezoidal rule. DIGITAL uses a zero-order hold and the forward
+    Euler method, like a plain digital controller.
     """
 
     SECOND_ORDER = 0
@@ -41,18 +40,18 @@ class Scheme(IntEnum):
 
 
 class Law(IntEnum):
-    """Kind of control law of an arm.
+    """Type of control law used by an arm.
 
     ADAPTIVE estimates the dynamic parameters of the arm, optionally within bounds. KNOWN
-    compensates the known gravity torque:
+    compensates for the known gravity torque:
 
         tau = G(q) - K e - d qd - Kd ed + k_f felt
 
     Here q and qd are the joint angles and velocities, G is the gravity torque, e and ed are the
-    errors of position and velocity, and felt is the torque that acts ON the other arms. The
-    gains are the stiffness K, the damping d, the derivative gain Kd and the force gain k_f. The
-    gains decide whether the law is P+d, PD+d or direct force reflection. USER is a law in
-    Python, either written by a user or from `trilat_net.laws`.
+    position and velocity errors, and felt is the torque ON the other arms. The gains are the
+    stiffness K, the damping d, the derivative gain Kd and the force gain k_f. Depending on the
+    gains, the law is P+d, PD+d or direct force reflection. USER is a law in Python, either
+    written by a user or taken from `trilat_net.laws`.
     """
 
     ADAPTIVE = 0
@@ -65,14 +64,12 @@ LEAST_STOP_S = 0.1
 
 
 class StaleAction(IntEnum):
-    """Reaction of a site while a peer is silent for too long.
+    """What a site does while a peer has been silent for too long.
 
-    A site is a process that runs one arm, and a peer is another site that it follows.
-
-    USE follows the last known state of the peer. HOLD keeps the last reference, the position
-    that the arm follows. BRAKE keeps the pose that the arm had when the peer fell silent. GLIDE
-    brings the arm smoothly to rest. With GLIDE, the arm also waits at the start until samples
-    of all peers arrive, see `session_life`.
+    USE follows the last known state of the peer. HOLD freezes the reference at its last value.
+    BRAKE keeps the pose that the arm had when the peer fell silent. GLIDE brings the arm
+    smoothly to rest; with GLIDE, the arm also waits at the start until samples from all peers
+    arrive, see `session_life`.
     """
 
     USE = 0
@@ -82,18 +79,16 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """Reaction of an arm if no new message has arrived from another arm for too long.
-
-    The other arm is called a stale peer. The process that runs an arm is called a site.
+    """What a site does when a peer is stale, meaning that no new sample arrived for too long.
 
     Attributes:
         action: Reaction of the site while a peer is stale.
-        age_ns: Largest age of the newest sample, ns. For GLIDE, the largest time since a new
+        age_ns: Largest age of the newest sample, ns. For GLIDE, the longest time since a new
             sample could be used.
-        return_ns: Duration of the return to the reference of the peers, ns. Not used for GLIDE.
-        align_speed: For GLIDE: largest speed with which the arm returns to its peers, rad/s or
+        return_ns: Duration of the return to the peers' reference, ns. Not used for GLIDE.
+        align_speed: For GLIDE: largest speed at which the arm returns to its peers, rad/s or
             m/s.
-        align_limit: For GLIDE: longest distance of this return, rad or m.
+        align_limit: For GLIDE: largest distance over which the arm may return, rad or m.
         degrades: For GLIDE: True if the site continues without a lost peer, see `lost_peers`.
     """
 
@@ -108,13 +103,14 @@ class StaleRule(NamedTuple):
 class MotionLimits(NamedTuple):
     """Limits of an arm's joint angles, and of how fast its reference and torque may change.
 
-    A limit is one number for all joints or coordinates, or one number for each of them.
+    Each limit has either a single entry for all joints or coordinates, or one entry for each of
+    them.
 
     Attributes:
         q_min: Smallest joint angles, rad.
         q_max: Largest joint angles, rad.
         qd_des_limit: Largest speed of the reference, rad/s; in task space m/s.
-        tau_rate: Largest rate of the control torque, N m/s.
+        tau_rate: Largest rate of change of the control torque, N m/s.
     """
 
     q_min: Vector = (-math.inf,)
@@ -126,15 +122,15 @@ class MotionLimits(NamedTuple):
 class RestGains(NamedTuple):
     """Gains of the controller that brings an arm to rest and holds it, see `resting`.
 
-    It acts, for example, while another arm is silent. Each vector has a single number for all
-    joints, or a number per joint.
+    This controller is active, for example, while another arm is silent. Each vector has a
+    single entry for all joints, or one entry per joint.
 
     Attributes:
-        damping: Damping B of the joints, N m s/rad.
-        time_s: Time constant with which the damping alone stops a joint, s. This is true for
-            the inertia for which B was chosen.
-        deceleration: Deceleration of the reference, the motion that the joints follow while
-            they come to rest, rad/s^2.
+        damping: Joint damping B, N m s/rad.
+        time_s: Time constant with which damping alone stops a joint, s, assuming the inertia
+            for which B was chosen.
+        deceleration: Deceleration of the reference that the joints follow while coming to rest,
+            rad/s^2.
     """
 
     damping: Vector = (0.0,)
@@ -142,9 +138,9 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains by the names of their fields in the state of an arm.
+        """Returns the gains, keyed by field name in the state of an arm.
 
-        They are "damping", "integral" and "deceleration". The integral gain is the damping
+        The keys are "damping", "integral" and "deceleration". The integral gain is the damping
         divided by 4 `time_s`, in N m/rad.
         """
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
@@ -161,8 +157,8 @@ class RestGains(NamedTuple):
             qd: Joint velocities of one or several arms, shape (..., n), rad/s.
 
         Returns:
-            The time in s for each set of n velocities, shape (...). If nothing else slows down
-            the joints, their reference has stopped after this time.
+            The time in s for each set of n velocities, shape (...), after which the reference
+            of the joints has stopped, assuming that nothing else slows the joints down.
         """
         stop_times_s = np.abs(qd) / self.deceleration
         slowest_s = stop_times_s.max(axis=-1)  # of the joints of an arm
@@ -175,21 +171,21 @@ class LinkSetup(NamedTuple):
 
     Attributes:
         peer: Name of the peer.
-        alpha: Dominance factor of the peer, its weight in this site's reference, Eq. (6).
+        alpha: Dominance factor of the peer (its weight in this site's reference), Eq. (6).
         rate_hz: Tick rate of the peer, Hz.
-        q0: Start pose of the peer, rad, or of its end effector; in use until the first sample
+        q0: Start pose of the peer, in rad, or of its end effector. Used until the first sample
             is due (L7).
-        key: Key from which the random numbers of the link follow, see `link_key`.
-        models: Models of the delay in the order of their first stamps. The first model applies
-            from stamp 0.
-        traces: For each model the points of its trace, a table of delays by time, shape (n, 2),
-            see `Points`. None for a model without a trace.
-        outages: Interruptions of the link: pairs of first stamp and end, ns.
-        channel: Values that the peer's law sends besides the motion of the peer.
+        key: Key that determines the random numbers of the link, see `link_key`.
+        models: Delay models, ordered by the first time stamp to which they apply. The first
+            model applies from stamp 0.
+        traces: For each model, the points of its trace (a table of delays by time), shape (n,
+            2), see `Points`. None for a model without a trace.
+        outages: Interruptions of the link, as pairs of first stamp and end, ns.
+        channel: Values that the peer's law sends in addition to the motion of the peer.
         index_at_peer: Index of this site among the peers of the peer, in scenario order.
-        speed_limit: Largest speeds of the peer's joints, rad/s, beyond which its samples are
-            dropped. () for no limit.
-        bit: Bit of the peer in sets of sites, which are integers with a bit per site.
+        speed_limit: Joint speeds of the peer above which its samples are dropped, rad/s. () for
+            no limit.
+        bit: The peer's bit in sets of sites, which are integers with one bit per site.
         followed: Set of the sites that the peer follows.
         dispensable: True if the site may continue without the peer after the peer is lost.
     """
@@ -213,17 +209,17 @@ class LinkSetup(NamedTuple):
 class TaskSetup(NamedTuple):
     """Settings of an arm whose end effector follows other end effectors (task space).
 
-    For example, it may follow them in position along x and y only, while z is free.
+    For example, it may follow their x and y positions only, while z is free.
 
     Attributes:
-        axes: For each coordinate of the end effector 1 if it follows the other arms, otherwise
+        axes: For each coordinate of the end effector, 1 if it follows the other arms, otherwise
             0. Three coordinates are a position, and six are a pose.
-        scale: Size of the common coordinates in relation to this arm: 2 means that 1 m of
-            motion of this arm counts as 2 m.
-        posture: Joint angles that the arm prefers if the end effector leaves it a choice, rad.
-        posture_rate: Rate with which the arm approaches these angles, 1/s.
-        singular_value: Near a singular pose, the Jacobian is damped if its least singular value
-            may be below this number, m/rad.
+        scale: Size of the shared coordinates relative to this arm: with a scale of 2, moving
+            this arm by 1 m counts as 2 m.
+        posture: Joint angles that the arm prefers where the end effector leaves a choice, rad.
+        posture_rate: Rate at which the arm approaches these angles, 1/s.
+        singular_value: Threshold for damping the Jacobian near a singular pose: it is damped
+            where its smallest singular value may fall below this value, m/rad.
     """
 
     axes: tuple[float, ...]
@@ -238,10 +234,10 @@ class ChainSetup(NamedTuple):
 
     Attributes:
         joints: The joints, starting at the base.
-        gravity_m_s2: Gravitational acceleration in the frame of the base, m/s^2.
+        gravity_m_s2: Gravitational acceleration in the base frame, m/s^2.
         tip_m: Position of the end effector in the frame of the last link, m.
         tip_rotation: Orientation of the end effector in that frame.
-        task: The setup in task space. None if the arm follows joint by joint.
+        task: Task-space settings. None if the arm follows joint by joint.
     """
 
     joints: tuple[ChainJoint, ...]
@@ -252,29 +248,30 @@ class ChainSetup(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """Kind of control law of an arm and the gains of the law, in a form for compiled code.
+    """Control law of an arm and its gains, in a form suitable for compiled code.
 
-    Gains of other kinds of law have no effect. Diagonal matrices are vectors. A vector of one
-    number has this number for all its entries.
+    Gains of other laws have no effect. Diagonal matrices are stored as vectors. A vector with a
+    single entry uses that value for all its entries.
 
     Attributes:
-        law: The law.
+        law: The type of law.
         Lambda: Rate at which errors decay, shape (n,), 1/s.
         Kp: Damping of the filtered error, shape (n,), N m s/rad.
-        Kd: Damping of the error's velocity, shape (n,), N m s/rad.
+        Kd: Damping of the error velocity, shape (n,), N m s/rad.
         Gamma: Adaptation gain per parameter, shape (P,).
-        theta_hat0: The first estimate, shape (P,).
+        theta_hat0: Initial estimate, shape (P,).
         low: Lower bound of each estimate, shape (P,).
         high: Upper bound of each estimate, shape (P,).
-        known: The parameters that KNOWN assumes, shape (P,).
+        known: Arm parameters assumed by KNOWN, shape (P,).
         K: Stiffness of KNOWN, shape (n,), N m/rad.
         d: Damping of KNOWN, shape (n,), N m s/rad.
         k_f: Gain of the reflected force of KNOWN, shape (n,), dimensionless.
         rho: Largest robust torque of ADAPTIVE, shape (n,), N m.
         width: Speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
-        friction: Fraction of a chain's joint friction that ADAPTIVE compensates, shape (n,).
+        friction: Fraction of a chain's joint friction for which ADAPTIVE compensates, shape
+            (n,).
         absolute: True if r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers.
-            Only the linear analysis uses this.
+            Used only by the linear analysis.
     """
 
     law: Law
@@ -296,39 +293,38 @@ class Gains(NamedTuple):
 
 
 class SiteSetup(NamedTuple):
-    """All settings of one arm and its controller, as numbers.
+    """All settings of an arm and its controller, in numerical form.
 
-    The state before the first control period follows from them. The process of an arm is called
-    a site.
+    They also determine the state before the first control period.
 
     Attributes:
-        name: The site's name.
-        rate_hz: The tick rate, Hz.
-        scheme: The sampling of the law.
-        gains: The law and its gains.
-        theta: The true parameters of the arm, shape (P,).
-        g_m_s2: Gravitational acceleration, m/s^2. A chain uses the value of its `ChainSetup`
+        name: Name of the site.
+        rate_hz: Tick rate, Hz.
+        scheme: How the law is discretised.
+        gains: The control law and its gains.
+        theta: True parameters of the arm, shape (P,).
+        g_m_s2: Gravitational acceleration, m/s^2. A chain uses the value in its `ChainSetup`
             instead.
-        lengths_m: Lengths of the two links, m; without effect for a chain.
-        tau_limit_nm: Largest control torque of a joint, N m; one number, or one per joint.
-        qd_limit_rad_s: Joint speed beyond which the run counts as diverged, rad/s.
-        q0: The start pose, rad.
-        qd0: The start velocity, rad/s.
-        actors: Operators and environments of the arm, one row for each.
-        links: The links from the peers, in scenario order.
-        ramps: The scripted changes of the dominance factors, in the order of their starts.
-        on_stale: The rule for a stale peer.
-        external: True if the arm is outside the program, so that its motion is measured and not
-            simulated.
+        lengths_m: Lengths of the two links, m; ignored for a chain.
+        tau_limit_nm: Largest control torque of a joint, N m. A single value, or one per joint.
+        qd_limit_rad_s: Joint speed above which the run counts as diverged, rad/s.
+        q0: Start pose, rad.
+        qd0: Initial velocity, rad/s.
+        actors: Operators and environments of the arm, one row each.
+        links: Links from the peers, in scenario order.
+        ramps: Scripted changes of the dominance factors, ordered by start time.
+        on_stale: How to react to a stale peer.
+        external: True if the arm is outside the program, in which case its motion is measured
+            instead of simulated.
         law_factory: Creates the user's law. None if the kernel computes the law.
         theta_known: False if `theta` does not describe the arm, because the arm is external and
             was not identified.
-        chain: The arm if it is a chain. None for the planar two-link arm.
-        channel: The values that the site's law sends to its peers.
-        limits: Limits of the motion.
-        rest: The gains with which the arm comes to rest.
-        bit: The bit of the site in sets of sites, which are integers with a bit per site.
-        bodies: Number of bodies in the simulated scene with poses that are recorded.
+        chain: Settings of the arm if it is a chain. None for the planar two-link arm.
+        channel: Values that the site's law sends to its peers.
+        limits: Limits on the motion.
+        rest: Gains used to bring the arm to rest.
+        bit: The site's bit in sets of sites, which are integers with one bit per site.
+        bodies: Number of bodies in the simulated scene whose poses are recorded.
     """
 
     name: str
@@ -363,10 +359,10 @@ class SiteSetup(NamedTuple):
         """Returns the lengths of all vectors of an arm, such as joint angles and torques.
 
         Args:
-            chain: The arm if it is a chain of joints. None for the planar two-link arm.
+            chain: Settings of the arm if it is a chain of joints. None for the planar two-link
+                arm.
             sent: Number of values that the control law sends to other arms in each period.
-            actors: Operators and environments of the arm. At most one of them is a person or
-                program that moves the arm during the run.
+            actors: Operators and environments of the arm, with at most one live operator.
         """
         joints = JOINTS if chain is None else len(chain.joints)
 
@@ -397,16 +393,16 @@ class SiteSetup(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """Lengths of the vectors in the state of this arm, for example one number per joint.
+        """Lengths of the vectors in the state of this arm, for example the number of joints.
 
-        Each body of the simulated scene adds seven numbers, its pose.
+        Each body in the simulated scene adds seven values for its pose.
         """
         layout = self.make_layout(self.chain, self.channel.record_size, self.actors)
         return layout._replace(bodies=7 * self.bodies)
 
     @property
     def live_actor(self) -> int:
-        """Index of the live operator among the operators and environments. -1 without one.
+        """Index of the live operator among the operators and environments, or -1 if none.
 
         A live operator is a person or program that moves the arm during the run.
         """
@@ -417,19 +413,19 @@ class SiteSetup(NamedTuple):
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:
-        """Vectors that the control law of this site reads from each of the other sites.
+        """Vectors that the control law of this site reads from each of its peers.
 
-        A site is the process that runs one arm. A control law may send vectors to other sites
-        besides the motion of its arm. A vector that another site does not send is zero.
+        A control law may send vectors to other sites in addition to the motion of its arm. A
+        vector that a peer does not send reads as zero.
 
         Returns:
-            A description of each vector, in the order in which the law receives the vectors.
+            A description of each vector, in the order in which the law receives them.
         """
         channels = [link.channel for link in self.links]
         return LawChannel.join_received([*channels, self.channel])
 
     def law_context(self) -> LawContext:
-        """Returns the facts about the arm and its peers with which a user's law is created.
+        """Returns the information about the arm and its peers needed to create a user's law.
 
         The dynamic parameters theta are empty for an external arm that was not identified.
         """

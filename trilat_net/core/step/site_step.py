@@ -1,17 +1,17 @@
 """Runs the control loop of an arm, one period per call of `Site.step`.
 
-The caller provides the input of a period, for example the states (samples) that arrived from
-other arms, and gets the record with all results. `Site.step` writes the samples into arrays,
-calls the compiled function `kernel.site_tick`, and converts the results to a record. If the
-control law was written by a user, the law is called between the two halves of the period, which
-are compiled separately.
+The caller passes in the inputs of a period, such as the samples that arrived from other arms,
+and gets back a record with all results. `Site.step` writes the samples to arrays, calls the
+compiled function `kernel.site_tick`, and converts the results to a record. A control law
+written by a user is called between the two halves of the period, which are compiled separately.
 
 Invariant:
-    - Live sessions, simulations and the verification of logs use `Site.step`. Only the fast
-      simulation of all arms (`fused_run`) does not, and it calls the same compiled functions.
+    - Live sessions, simulations and the verification of logs use `Site.step`. The only
+      exception is the fast simulation of all arms (`fused_run`), which calls the same compiled
+      functions.
     - The result of `Site.step` depends only on the state of the site and on its argument. The
-      method reads no clock and no network connection, and draws no random number.
-    - Equal inputs give results that are equal to the last bit.
+      method reads no clock and no network connection, and draws no random numbers.
+    - The same inputs always produce bit-identical results.
 """
 
 import math
@@ -65,18 +65,18 @@ _NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
 class _TickParts(NamedTuple):
-    """Internal parts of a `Site` that compute many recorded control periods in one call.
+    """Internals of a `Site` that are used to compute many recorded control periods in one call.
 
     Attributes:
         buffers: Input and output of a tick.
-        calendar_sizer: Enlarges the calendars, in which samples wait.
-        has_user_law: True if a user wrote the control law.
-        reflects: True if the law uses the external torques on the other arms (peers).
+        calendar_sizer: Enlarges the calendars in which samples wait.
+        has_user_law: True if the control law is user-written.
+        reflects: True if the law uses the external torques on the peers' arms.
         keeps_forces: True if the site stores these torques.
         glides: True if the arm comes to rest while a peer is silent (the rule `glide`).
         degrades: True if the site continues without lost peers.
         hand_index: Index of the person or program that moves the arm among the operators and
-            environments. -1 if nobody moves the arm.
+            environments, or -1 if nobody moves the arm.
     """
 
     buffers: TickBuffers
@@ -90,9 +90,9 @@ class _TickParts(NamedTuple):
 
 
 class Site:
-    """One arm with its controller, and the network links over which it receives samples.
+    """An arm with its controller, and the network links over which it receives samples.
 
-    The process of an arm (site) creates this object and calls `step` once per control period. A
+    Each site process creates one such object and calls `step` once per control period. A
     simulation in virtual time does the same for each arm.
 
     Args:
@@ -103,8 +103,8 @@ class Site:
         rate_hz: Tick rate, Hz.
         peers: Names of the peers, in scenario order.
         layout: Lengths of the site's vectors.
-        law_failure: Last failure of a user's law under the rule `glide`. None if the law has
-            never failed.
+        law_failure: Most recent failure of a user's law under the rule `glide`. None if the law
+            has never failed.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -149,7 +149,7 @@ class Site:
         if self._law is not None and self._glides:
             self._law_memory = self._law.memory
         self._remembers = self._glides or self._user_law is not None
-        # Looking up a field of a structured array takes longer than reading its numbers.
+        # Looking up a field of a structured array takes longer than reading its values.
         s = self._site
         self._q_held = s["q_held"][0]
         self._return_from_ns = s["return_from_ns"]
@@ -165,20 +165,21 @@ class Site:
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
-        """Returns the inputs of the spring by which a person or program pulls the arm.
+        """Returns the inputs of the spring through which a person or program pulls the arm.
 
-        The inputs are the grip, which multiplies the force, and the target of the spring. They
-        change in each control period.
+        The inputs are the grip, which scales the force, and the target of the spring. They
+        change in every control period.
 
         Args:
             index: Index of the live hand among the operators and environments.
 
         Returns:
-            The grip, shape (1,), the target, and the target one second later. They are views:
-            writing into them moves the live hand.
+            The grip, shape (1,), the target, and the target one second later. They are views,
+            so writing to them moves the live hand.
         """
         actors = self._arrays.actors
-        # The field `hand` of a record has grip, number, source, target and rate of the target.
+        # The field `hand` of a record contains grip, number, source, target and target
+        # velocity.
         coordinates = (self.layout.hand - 3) // 2
         # The field `a` of a live hand is its target, and `b` the target one second later.
         grip = actors["grip"][index : index + 1]
@@ -187,17 +188,17 @@ class Site:
         return grip, target, target_ahead
 
     def _plug_law(self, setup: SiteSetup) -> None:
-        """Creates the control law that a user wrote, and compiles the other stages of a tick.
+        """Creates the user's control law, and compiles the other stages of a tick.
 
-        A tick is a period of the control loop. A user's law is called between two compiled
-        functions: `_sense` computes the stages of a tick before the torque, and `_act` those
-        after it. Without such a law, nothing is compiled here.
+        A user's law is called between two compiled functions: `_sense` computes the stages of a
+        tick before the torque, and `_act` those after it. If there is no such law, nothing is
+        compiled here.
 
         `_user_law` is the user's object. `_law` calls this object with the arrays of this site,
-        and may be a compiled form of the object. Both are None without a user's law.
+        and may be a compiled form of the object. Both are None if there is no user law.
 
         Args:
-            setup: Setup of the site, which may contain a factory of the law.
+            setup: Setup of the site, which may contain a factory for the law.
         """
         self._user_law = None
         if setup.law_factory is not None:
@@ -210,9 +211,8 @@ class Site:
         arrays = self._arrays
         buffers = self._buffers
         self._law = plug_law(self._user_law, setup, arrays, self._sent)
-        # Compile now, and not within the time that the law has for a tick. Only the types of
-        # the arguments matter: the zeros take the place of the tick, its time in ns, and the
-        # number of arrivals.
+        # Compile now, to avoid using up the law's time for a tick. Only the argument types
+        # matter: the zeros stand for the tick, its time in ns, and the number of arrivals.
         self._law.bind()
         self._sense = bind_leaf(sense_stages, 0, 0, 0, arrays, buffers)
         self._act = bind_leaf(
@@ -227,14 +227,14 @@ class Site:
         )
 
     def apply_change(self, command: CoreChange, t_ns: int) -> None:
-        """Applies a change to an arm's process while it runs, for example a new network delay.
+        """Applies a change to a running site, for example a new network delay.
 
-        A change that starts later is stored until its time.
+        A change that takes effect later is stored until then.
 
         Args:
             command: The change.
-            t_ns: Present time in ns since the start of the session. The site computes no more
-                control periods before this time.
+            t_ns: Current time in ns since the start of the session. The site will not compute
+                control periods before this time any more.
 
         Raises:
             ValueError: There are too many planned changes.
@@ -244,39 +244,39 @@ class Site:
             self._sizer.add_model(command.peer, command.model)
 
     def start_at(self, k: int) -> None:
-        """Makes `k` the first tick (control period) of an arm that joins a running session.
+        """Makes `k` the first tick of an arm that joins a running session.
 
-        No tick must have been computed before. The arm is at rest in its start pose, and no
-        sample (state) of another arm is in use or waits. The models of delay and loss of the
-        links process all samples that the other arms have sent until tick k - 1.
+        Must be called before any tick is computed. The arm is at rest in its start pose, and no
+        sample from another arm is in use or waiting. The delay and loss models of the links are
+        advanced past all samples that the other arms have sent up to tick k - 1.
 
         Args:
-            k: Number of the first tick.
+            k: First tick.
         """
         links_may_be_ahead = k <= self._site["first"]
         if links_may_be_ahead:
-            # The links may be ahead of tick k: start them anew.
+            # The links may be ahead of tick k, so start them from scratch.
             self.restore_links(k, [None] * len(self.peers), ())
         self._site["first"] = k
         for n, link in enumerate(self._links):
             peer_hz = int(link["rate_hz"])
             last_sample = (k - 1) * peer_hz // self.rate_hz
             if last_sample >= 0:
-                # The result is not needed: the call advances the random models of the link to
-                # this sample.
+                # The result is not needed. The call advances the link's random models to this
+                # sample.
                 find_release(n, last_sample, self._arrays)
-        # Copies of samples that were sent before the site joined do not count.
+        # Copies of samples that were sent before the site joined are not counted.
         self._links["copies"] = 0
 
     def step(self, tick: TickInput) -> TickRecord:
         """Computes one period of the control loop: from messages to torque and motion.
 
-        This is the only way in which time advances, in live runs, simulations and replays
-        alike. Therefore the same input always gives the same results.
+        Time only advances through this method, whether in live runs, simulations or replays.
+        The same input therefore always produces the same results.
 
         Args:
-            tick: Number of the period and its inputs. The number must follow that of the
-                previous call.
+            tick: Number of the period, which must follow that of the previous call, and its
+                inputs.
 
         Returns:
             The record of the period: its inputs and results.
@@ -334,19 +334,19 @@ class Site:
         )
 
     def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
-        """Computes a whole control period: from received messages to the results and motion.
+        """Computes a complete control period, from received messages to the results and motion.
 
-        Without a user's control law, one compiled function computes all eight stages (`kernel`
-        lists them). A user's law is called between two compiled functions, one for the stages
+        Without a user's control law, one compiled function computes all eight stages (listed in
+        `kernel`). A user's law is called between two compiled functions, one for the stages
         before the torque and one for those after it.
 
         Args:
-            k: Number of the tick (control period).
+            k: Current tick.
             t_ns: Nominal time of the tick, ns since the start of the session.
             count: Number of arrivals in the buffers.
 
         Returns:
-            The memory of the user's law. Empty without such a law.
+            The memory of the user's law. Empty if there is no such law.
         """
         if self._law is None:
             if self._tick is None:
@@ -376,28 +376,28 @@ class Site:
         """Stores the measured motion of a real arm, in place of a simulated motion.
 
         Args:
-            measured: Angles, rad, and velocities, rad/s, of the joints, and the external torque
-                tau_x, N m. An empty torque counts as zero.
+            measured: Joint angles, rad, joint velocities, rad/s, and the external torque tau_x,
+                N m. An empty torque is treated as zero.
         """
         s: Row = self._site[0]
         s.q = measured.q
         s.qd = measured.qd
-        # The record has the sign of Eq. (8); the row has the torque ON the arm.
+        # The record uses the sign of Eq. (8); the row contains the torque ON the arm.
         s.sensed = [-torque for torque in measured.tau_x] or 0.0
 
     def _compute_law(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque of a control period by the control law that a user wrote.
+        """Computes the torque of a control period with a user-written control law.
 
-        The law writes the torque into the state of the site. The result of this method is the
-        memory of the law, the numbers that it keeps from period to period.
+        The law writes the torque to the state of the site. The return value is the memory of
+        the law, which it keeps from one period to the next.
 
         The rule `glide` brings the arm to rest when something fails. Under this rule, a law
-        that fails gives NaN as torque. `act_stages` then enters the mode FAULT with the reason
-        NOT_FINITE. The law is not called again until the fault is reset, and then continues
-        from the memory that it had before the failure.
+        that fails produces NaN as its torque. `act_stages` then enters the mode FAULT with the
+        reason NOT_FINITE. The law is not called again until the fault is reset, when it
+        continues with the memory that it had before the failure.
 
         Args:
-            k: Number of the tick (control period).
+            k: Current tick.
             t_ns: Nominal time of the tick, ns since the start of the session.
 
         Raises:
@@ -423,13 +423,13 @@ class Site:
 
     @property
     def speed_limits(self) -> list[float]:
-        """Largest permitted speed of each joint, rad/s or m/s: the key `qd_limit_rad_s`."""
+        """Largest permitted joint speeds, rad/s or m/s, from the key `qd_limit_rad_s`."""
         limits: list[float] = self._site[0]["qd_limit"].tolist()
         return limits
 
     @property
     def mode(self) -> Mode:
-        """Mode of the arm in the last control period, for example RUN if it followed others."""
+        """Mode of the arm in the last control period, for example RUN if it follows others."""
         return _MODES[self._mode.item()]
 
     @property
@@ -442,12 +442,12 @@ class Site:
 
     @property
     def arrays(self) -> SiteArrays:
-        """Arrays with the present state of the arm's process. Callers must not change them."""
+        """Arrays with the current state of the site, which callers must not modify."""
         return self._arrays
 
     @property
     def parts(self) -> "_TickParts":
-        """Internal parts with which `recorded_ticks` computes many control periods at once."""
+        """Internals that `recorded_ticks` uses to compute many control periods at once."""
         return _TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,
@@ -463,26 +463,26 @@ class Site:
     def q(self) -> list[float]:
         """Joint angles at the start of the next control period, one per joint, rad.
 
-        The last record contains the joint angles at the start of its own period.
+        This differs from the last record, which contains the joint angles at the start of its
+        own period.
         """
         joints = self.layout.joints
         angles: list[float] = self._site[0]["q"][:joints].tolist()
         return angles
 
     def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
-        """Applies how a person or program pulls the arm in this control period.
+        """Applies the pull of a person or program on the arm in this control period.
 
         Args:
-            vector: The action in the form of `HandInForce`: how firmly the arm is gripped, to
-                which target it is pulled, and the velocity of the target. Empty if nobody
-                holds the arm.
+            vector: The action in the form of `HandInForce`: grip firmness, target, and velocity
+                of the target. Empty if nobody holds the arm.
 
         Returns:
             The action for the record of the tick. Empty if the site has no live hand.
         """
         if self._hand is None:
             return ()
-        # Views of the row: the assignments change its numbers.
+        # These are views of the row, so assigning to them changes the row.
         grip, target, target_ahead = self._hand
         action = list(vector) or HandInForce.list_empty(len(target))
         hand = HandInForce.read(action)
@@ -494,12 +494,12 @@ class Site:
         return action
 
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
-        """Returns the checksum of the samples (states of other arms) that arrived, for the log.
+        """Returns the checksum of the samples that arrived, for the log.
 
-        A later verification of the log compares the checksum, which covers only what this site
-        uses: sender, tick and motion of each sample, then the forces if the site reflects
-        forces to its user, then the values that the other control laws send if the law of this
-        site reads such values.
+        The checksum is compared when the log is verified. It only covers what this site uses:
+        the sender, tick and motion of each sample, then the forces if the site reflects forces
+        to its user, then the values sent by the other control laws if this site's law reads
+        such values.
 
         Args:
             packed_bytes: Number of bytes of the packed arrivals: peers, ticks and motions.
@@ -520,22 +520,22 @@ class Site:
         return crc
 
     def _held_memory(self) -> list[float]:
-        """Lists the numbers of the site that the next tick needs and no other field records.
+        """Lists the state variables that the next tick needs and no other field records.
 
-        With them in the field `mem` of its record, a run can be continued from any tick. A site
-        that is not under the rule `glide`, which brings arms to rest, has only the first two:
+        The field `mem` of a record stores them, which makes it possible to continue a run from
+        any tick. Only a site under the rule `glide`, which brings arms to rest, has more than
+        the first two:
 
-        - `q_held`: the reference (position that the arm follows) that is held, or the start
-          value of an offset that falls to zero,
-        - `return_from_ns`: the time at which the present rest, return or run began, ns,
-        - `qd_held`: the rate of `q_held`,
-        - `reason`: why the mode changed last, a `LifeReason`,
-        - `used_ns`: for each peer the time at which its last sample came into use, ns,
+        - `q_held`: the held reference, or the initial value of an offset that decays to zero,
+        - `return_from_ns`: the time at which the current rest, return or run started, ns,
+        - `qd_held`: the rate of change of `q_held`,
+        - `reason`: why the mode last changed, a `LifeReason`,
+        - `used_ns`: for each peer, the time at which its last sample came into use, ns,
         - `tau_held`: the torque of each joint that carries a constant load at rest, N m,
         - `q_rest`, `qd_rest`: the reference that brings the joints to rest, only in task space,
         - `gone`: the state of each peer, only if the site continues without lost peers.
 
-        `restore_state` reads the same numbers in the same order.
+        `restore_state` reads the same values in the same order.
         """
         return_from_ns = float(self._return_from_ns.item())
         memory = [*self._q_held.tolist(), return_from_ns]
@@ -554,9 +554,9 @@ class Site:
         return memory
 
     def counts(self) -> tuple[LinkCounts, ...]:
-        """Returns how many messages arrived, came late or were lost, for each network link.
+        """Returns how many messages arrived, were late or were lost, for each network link.
 
-        The links are in the order of the scenario. `LinkCounts` explains the counts.
+        The links are in scenario order. See `LinkCounts` for the individual counts.
         """
         counts = []
         for link in self._links:
@@ -565,25 +565,21 @@ class Site:
         return tuple(counts)
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Finds the control period of this arm in which another arm's message is first used.
-
-        Control periods are called ticks. A message (sample) is the state that the other arm
-        (peer) sends once per period of its own loop.
+        """Finds the control period of this arm in which a peer's sample is first used.
 
         Args:
             peer: Index of the peer.
-            tick: Number of the period in which the peer sent the sample.
+            tick: Tick in which the peer sent the sample.
 
         Returns:
-            The number of this site's period if the sample arrives in time. None if the link
-            loses the sample, or if the sample is so old that its delivery time is no longer
-            stored.
+            The tick of this site if the sample arrives in time. None if the link drops the
+            sample, or if the sample is so old that its delivery time is no longer stored.
         """
         release = int(find_release(peer, tick, self._arrays))
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if a link has only the delay of the real network, not a simulated one.
+        """Returns True if the only delay of a link is that of the real network.
 
         Args:
             peer: Index of the sender at the other end of the link.
@@ -593,32 +589,32 @@ class Site:
         return bool(model["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
-        """Returns the rate of another arm's control loop, Hz, which may differ from this arm's.
+        """Returns the rate of a peer's control loop, Hz, which may differ from this arm's.
 
         Args:
-            peer: Index of the other arm (peer), in scenario order.
+            peer: Index of the peer, in scenario order.
         """
         return int(self._links[peer]["rate_hz"])
 
     def restore_state(self, before: TickRecord, last: TickRecord) -> None:
         """Restores the state of the arm and its control law from the records of a run.
 
-        After a further call of `restore_links`, `step` continues the run.
+        After a subsequent call of `restore_links`, `step` continues the run.
 
-        The field `mem` of a record contains the numbers of the site and its law that no other
-        field contains. For m coordinates that the sites share, these are
+        The field `mem` of a record contains the state variables of the site and its law that no
+        other field contains. For m coordinates shared between sites, these are
 
-        - the reference that is held (m numbers) and the time from which it is held, ns,
-        - under the rule `glide`, by which an arm comes to rest while a peer (another arm) is
-          silent, the further numbers that `_restore_life` reads,
-        - the numbers that the user's law remembers, if there is one.
+        - the held reference (m values) and the time since when it is held, ns,
+        - under the rule `glide` (where an arm comes to rest while a peer is silent), the
+          additional values read by `_restore_life`,
+        - the memory of the user's law, if there is one.
 
-        `mem` is empty if there are no such numbers.
+        `mem` is empty if there is nothing to store.
 
         Args:
             before: Record of the control period before `last`. If `last` is the first record,
-                any record can be given.
-            last: Last record of the part that is not computed again.
+                any record can be passed.
+            last: Last record of the part that is not recomputed.
         """
         s: Row = self._site[0]
         shared = self.layout.shared
@@ -642,29 +638,30 @@ class Site:
         if self._law is not None:
             self._law.restore(law_memory)
             self._law_memory = list(law_memory)
-        # Compute what is in no record: errors, external torques, and the motion after `last`.
+        # Compute what no record contains: errors, external torques, and the motion after
+        # `last`.
         resume_stages(last.tick, self._arrays)
 
     def _restore_life(self, memory: list[float]) -> list[float]:
         """Restores the memory of the rule `glide` from the field `mem` of a record.
 
-        Under this rule, an arm comes to rest while a peer (another arm) is silent, see
-        `session_life`. The numbers are read in the order in which `_held_memory` writes them:
+        Under this rule, an arm comes to rest while a peer is silent, see `session_life`. The
+        values are read in the order in which `_held_memory` writes them:
 
-        - `qd_held`: the rate of the held reference, one number per shared coordinate,
-        - `reason`: why the mode changed last, a `LifeReason`,
+        - `qd_held`: the rate of change of the held reference, one value per shared coordinate,
+        - `reason`: why the mode last changed, a `LifeReason`,
         - `used_ns`: the time at which the last sample of a peer came into use, per peer, ns,
         - `tau_held`: the torque that carries a constant load at rest, per joint, N m,
-        - only in task space `q_rest` and `qd_rest`: the reference that brings the joints to
-          rest, two numbers per joint,
-        - only if the site continues without lost peers `gone`: the state of each peer.
+        - `q_rest` and `qd_rest`, only in task space: the reference that brings the joints to
+          rest, two values per joint,
+        - `gone`, only if the site continues without lost peers: the state of each peer.
 
         Args:
-            memory: Numbers of the record, after the held reference and the time from which it
-                is held.
+            memory: Contents of `mem`, after the held reference and the time since when it is
+                held.
 
         Returns:
-            The remaining numbers, which belong to the user's law.
+            The remaining values, which belong to the user's law.
         """
         s: Row = self._site[0]
         shared = self.layout.shared
@@ -674,7 +671,7 @@ class Site:
         s.reason = int(memory[shared])
         remaining = memory[shared + 1 :]
 
-        # Each number is removed from `remaining` once it is restored.
+        # Each value is removed from `remaining` once it has been restored.
         self._links["used_ns"] = remaining[:peers]
         remaining = remaining[peers:]
         s.tau_held = remaining[:joints]
@@ -697,19 +694,17 @@ class Site:
     ) -> None:
         """Restores the state of the network links, to continue a recorded run at tick k.
 
-        A site is a process that runs one arm, its peers are the other sites, and a tick is one
-        period of the control loop. A peer sends a sample, its state, in each tick. The state of
-        random models of delay and loss is not recorded. It is computed again from the start of
-        the run, which gives the same numbers.
+        The state of random delay and loss models is not recorded. It is recomputed from the
+        start of the run, which yields the same random numbers.
 
         Args:
-            k: The next tick.
-            in_use: For each peer the newest sample that has been used. None if there was no
-                sample.
+            k: Next tick.
+            in_use: For each peer, the newest sample that has been used, or None if there was
+                none.
             waiting: Samples that have arrived, but whose simulated delay has not passed.
 
         Raises:
-            ValueError: More than MAX_ARRIVALS samples wait.
+            ValueError: More than MAX_ARRIVALS samples are waiting.
         """
         self._arrays.calendars["tick"] = -1
         self._sizer.clear()
@@ -736,13 +731,12 @@ class Site:
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
     def _restore_received(self, peer: int, sample: Arrival | None) -> None:
-        """Restores the values that the control law of a peer sent with the sample in use.
+        """Restores the values that a peer's control law sent with the sample in use.
 
-        Control laws that users wrote can send values to each other, besides the motion of the
-        arms. The values are in the field `ch` of a sample, the state that a peer (another arm's
-        process) sends. The law of this site reads the values in an order of its own. For each
-        value that it reads, the array `columns` contains the index in `ch`, or -1 if the law of
-        the peer does not send this value, which is 0 then.
+        User-written control laws can send values to each other in addition to the motion of the
+        arms. These are in the field `ch` of a sample. The law of this site reads the values in
+        its own order: for each value that it reads, the array `columns` contains the index in
+        `ch`, or -1 if the peer's law does not send this value, which is then 0.
 
         Args:
             peer: Index of the peer.
@@ -754,31 +748,29 @@ class Site:
         if sample is None or not len(sample.ch):
             channel.received[peer] = 0.0
             return
-        # The index -1 selects the last number, the appended zero.
+        # The index -1 selects the last element, the appended zero.
         sent_and_zero = np.append(sample.ch, 0.0)
         channel.received[peer] = sent_and_zero[channel.columns[peer]]
 
     def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
-        """Writes the samples that arrived before a tick into the input buffers of the tick.
+        """Writes the samples that arrived before a tick to the input buffers of the tick.
 
-        A tick is a period of the control loop. A sample is the state that a peer (another arm's
-        process) sends. The buffers have three parts:
+        The buffers have three parts:
 
         - `arrivals`: peer, tick and motion of each sample,
         - `forces`: the external torques of the senders, if this site uses them,
-        - `sent`: the numbers that the laws of the senders sent, if the law of this site reads
-          such numbers.
+        - `sent`: the values sent by the senders' laws, if this site's law reads such values.
 
-        Later the tick moves the samples to the calendars, the ring buffers in which they wait
-        until their simulated delay has passed. If a sample does not fit there, the calendars
-        are replaced by larger ones.
+        The tick later moves the samples to the calendars, the ring buffers in which they wait
+        for their simulated delay to pass. If a sample does not fit there, the calendars are
+        replaced with larger ones.
 
         Args:
-            k: Number of the tick (control period).
+            k: Current tick.
             arrivals: Samples that arrived since the previous tick.
 
         Returns:
-            The number of bytes written into `arrivals`.
+            The number of bytes written to `arrivals`.
 
         Raises:
             ValueError: There are more than MAX_ARRIVALS arrivals.
@@ -797,7 +789,7 @@ class Site:
                 self._tick_arrays = (*self._arrays, *self._buffers)
             self._pack_arrival(self._arrival_bytes, packed_bytes, peer, tick, *q, *qd)
             packed_bytes += self._arrival_size
-        # A sample without forces or numbers has an empty vector, which counts as zeros.
+        # A sample without forces or sent values has an empty vector, which is read as zeros.
         if self._keeps_forces:
             for n, arrival in enumerate(arrivals):
                 self._buffers.forces[n] = arrival.tau_x or 0.0

@@ -1,14 +1,14 @@
-"""Defines the inputs, the results and the times of the control periods (ticks) of an arm.
+"""Defines the inputs, results and nominal times of an arm's control periods (ticks).
 
-The inputs of a tick are the samples (states) that arrived from other arms, and commands. The
-stored result of a tick is called its record. For example, with a loop at 1000 Hz, tick 250 is
-due 0.25 s after the start of the session. This module also defines the reasons and alarms that
-a log states when an arm starts or stops following the others.
+The inputs of a tick are commands and the samples that arrived from other arms. Its result is
+stored as a record. With a loop at 1000 Hz, for example, tick 250 is due 0.25 s after the start
+of the session. This module also defines the reasons and alarms that are logged when an arm
+starts or stops following the others.
 
 Invariant (laws L1 and L3 of docs/develop/design.md):
     - The nominal time of tick k is `k * 10^9 // rate_hz` nanoseconds after the start of the
-      session, where `rate_hz` is the rate of the loop. It is computed from k anew in each tick,
-      so that rounding errors do not add up.
+      session, where `rate_hz` is the rate of the loop. It is computed from k afresh in each
+      tick, to prevent rounding errors from accumulating.
     - The record of a tick contains all inputs of the tick.
 """
 
@@ -24,18 +24,18 @@ from ..links.delay import LinkModel
 from .jit import leaf
 
 BUCKETS_PER_S = 20
-"""Number of intervals per second for which a run without a log keeps its largest values."""
+"""Number of intervals per second for which a run without a log keeps the largest values."""
 
 
 @leaf
 def tick_ns(tick: int, rate_hz: int) -> int:
-    """Returns the nominal start of a control period (tick), ns since the start of the session.
+    """Returns the nominal start of a tick, ns since the start of the session.
 
-    It is exact in integers: tick * 10^9 // rate_hz. For example, tick 3 at 1000 Hz starts at
-    3000000 ns.
+    The result is exact in integers: tick * 10^9 // rate_hz. For example, tick 3 at 1000 Hz
+    starts at 3000000 ns.
 
     Args:
-        tick: Number of the tick (control period).
+        tick: Number of the tick.
         rate_hz: Tick rate, Hz.
     """
     return tick * 1_000_000_000 // rate_hz
@@ -43,28 +43,28 @@ def tick_ns(tick: int, rate_hz: int) -> int:
 
 @leaf
 def first_tick_at(due_ns: int, rate_hz: int) -> int:
-    """Returns the number of the first control period (tick) that begins at or after a time.
+    """Returns the number of the first tick that starts at or after a given time.
 
-    It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact: floor(k 10^9 /
-    rate) >= due if and only if k 10^9 >= due rate. The division of the negative number rounds
-    up.
+    This is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact, because
+    floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. Negating the numerator makes
+    the integer division round up.
 
     Args:
-        due_ns: The time, ns since the epoch, the common start of the session.
+        due_ns: The time, ns since the epoch (the common start of the session).
         rate_hz: Tick rate, Hz.
     """
     return -(-due_ns * rate_hz // 1_000_000_000)
 
 
 MAX_ARRIVALS = 4096
-"""Largest number of arrivals in a tick. A driver keeps further arrivals for the next tick."""
+"""Largest number of arrivals per tick. Drivers hold back any others until the next tick."""
 
 
 class LifeReason(IntEnum):
     """Reason why an arm last changed its mode, for example that another arm fell silent.
 
-    The reasons only exist under the rule `glide`, by which an arm waits for the others and
-    comes to rest while one of them is silent. `session_life` explains this rule.
+    Reasons exist only under the rule `glide`, where an arm waits for the others and comes to
+    rest while one of them is silent. `session_life` explains this rule.
     """
 
     START = 0
@@ -91,30 +91,30 @@ class LifeReason(IntEnum):
 
 
 RELEASE_REASONS = (LifeReason.RELEASED, LifeReason.STOP_RELEASED)
-"""Reasons of a stop in which brakes hold the arm, because its dead-man switch was released."""
+"""Reasons for a stop in which brakes hold the arm because its dead-man switch was released."""
 
 
 class LifeOrder(IntEnum):
-    """Order to a site, the process that runs one arm.
+    """An order to a site, such as to stop the arm.
 
-    Orders only exist under the rule `glide`, which `session_life` explains. Users give these
+    Orders exist only under the rule `glide`, which `session_life` explains. Users give these
     orders:
 
     - STOP: bring the arm to rest, in the mode STOPPED.
     - ENABLE: leave the mode STOPPED.
     - RESET: leave the mode FAULT.
 
-    The site gives the other orders itself. Most of them concern a real arm:
+    The site gives itself the remaining orders, most of which apply to a real arm:
 
     - ARM_SILENT: the arm has not sent its position for a short time.
     - ARM_LOST: the arm has not sent its position for a long time.
-    - ARM_BACK: the arm sends its position again.
+    - ARM_BACK: the arm is sending its position again.
     - RELEASED: nobody holds the dead-man switch.
     - HELD: somebody holds the dead-man switch again.
     - OVERRUN: the site was too slow and missed control periods.
 
-    If several orders arrive in the same period, the order with the highest number counts.
-    OVERRUN is applied in addition.
+    If several orders arrive in the same period, the one with the highest number takes
+    precedence. OVERRUN is applied in addition.
     """
 
     ENABLE = 1
@@ -129,14 +129,12 @@ class LifeOrder(IntEnum):
 
 
 class DominanceRamp(NamedTuple):
-    """Gradual change of the weights with which an arm follows the other arms, linear in time.
-
-    The weights are called dominance factors, and belong to one site, the process of an arm.
+    """A gradual change of the dominance factors of one site, linear in time.
 
     Attributes:
         start_ns: Start of the change, ns since the start of the session.
         end_ns: End of the change, ns since the start of the session, not before `start_ns`.
-        alpha: Factors at the end, per peer in scenario order.
+        alpha: Factors at the end of the ramp, one per peer in scenario order.
     """
 
     start_ns: int
@@ -145,13 +143,14 @@ class DominanceRamp(NamedTuple):
 
 
 class CoreChange(NamedTuple):
-    """Change that takes effect in an arm's process while it runs, as the control loop reads it.
+    """A change to a running site, in the form read by the control loop.
 
-    It changes the model of a network link or the weights with which the arm follows the others,
-    or it gives an order such as stop.
+    It changes the model of a network link or the dominance factors, or gives an order such as
+    stop.
 
     Attributes:
-        text: Text in the record, from which all readers derive the same change.
+        text: Description stored in the record, from which every reader can derive the same
+            change.
         peer: Index of the peer whose link changes; -1 for other changes.
         model: New model of the link.
         ramp: Change of the dominance factors.
@@ -168,10 +167,10 @@ class CoreChange(NamedTuple):
 
     @classmethod
     def give_order(cls, text: str, order: str, skipped: int) -> "CoreChange":
-        """Creates the change by which a site receives an order.
+        """Creates a change that gives an order to a site.
 
         Args:
-            text: Text in the record.
+            text: Description stored in the record.
             order: Name of the order in a log, such as "stop", see `LifeOrder`.
             skipped: With "overrun", the number of ticks before this one that the site missed.
         """
@@ -184,8 +183,8 @@ class PlantState(NamedTuple):
     Attributes:
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
-        tau_x: Negative of the torque with which operator and environment act ON the arm, N m.
-            Empty if the arm does not measure this torque.
+        tau_x: Negative of the torque exerted ON the arm by operator and environment, N m. Empty
+            if the arm does not measure this torque.
         bodies: Poses of the other bodies of the scene, as in `TickRecord.bodies`.
     """
 
@@ -196,16 +195,15 @@ class PlantState(NamedTuple):
 
 
 class TickInput(NamedTuple):
-    """All external inputs that may influence one period of the control loop.
+    """All external inputs that can influence one control period, as passed to `Site.step`.
 
-    `Site.step` receives this object. It contains the time, the messages and the measurements,
-    so the same input always gives the same results.
+    It contains the time, the messages and the measurements, so the same input always produces
+    the same results.
 
     Attributes:
         k: Number of the period.
-        arrivals: Samples (states of other arms) that arrived since the previous period, in
-            order.
-        commands: Changes of the settings that were ordered since the previous period.
+        arrivals: Samples that arrived since the previous period, in order of arrival.
+        commands: Changes of settings ordered since the previous period.
         measured: Measured state of a real or otherwise external arm. None if there is no new
             measurement.
         hand: Action of a person or program on the arm in this period, see `live_hand`. Empty if
@@ -220,20 +218,19 @@ class TickInput(NamedTuple):
 
 
 class LinkCounts(NamedTuple):
-    """Counts of messages on one network link since the start, such as late and lost messages.
+    """Message counts of one network link since the start, such as late and lost messages.
 
-    A link leads from another arm's process (peer) to this one. A message is a sample, the state
-    of the peer in one control period.
+    The messages are samples from the peer at the other end of the link.
 
     Attributes:
         accepted: Samples that arrived.
-        late: Arrived samples that came after they were due.
+        late: Samples that arrived after they were due.
         duplicate: Arrived samples that had already arrived before.
-        refused: Arrived samples whose stamp was out of range.
-        lost: Arrived samples that the link's model of losses dropped.
-        superseded: Samples that were never used, because a newer sample was released before
-            them or in the same tick.
-        copies: Duplicates that the link's model produced.
+        refused: Arrived samples whose time stamp was out of range.
+        lost: Arrived samples that the loss model of the link dropped.
+        superseded: Samples that were never used, because a newer one was released before them
+            or in the same tick.
+        copies: Duplicates produced by the model of the link.
     """
 
     accepted: int
@@ -265,32 +262,32 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns why an arm last changed its mode, for example from RUN to HOLD, from its log.
+    """Extracts from a record why an arm last changed its mode, for example from RUN to HOLD.
 
-    The arm must be under the rule `glide`, by which it comes to rest while another arm is
-    silent. Only then does the log contain the reason.
+    The arm must be under the rule `glide`, where it comes to rest while another arm is silent.
+    Only then does the record contain the reason.
 
     Args:
-        output: Record of the arm, the result of one control period.
+        output: Record of the arm.
     """
     shared = len(output.q_des)
     return LifeReason(int(output.mem[2 * shared + 1]))
 
 
 class LifeAlarm(NamedTuple):
-    """Alarm that tells people why an arm does not follow the others, and what they can do.
+    """An alarm that explains why an arm is not following the others, and how to fix it.
 
-    `LifeAlarm.find` creates it. Pages and terminals show it as long as the arm stays in this
-    mode.
+    It is created by `LifeAlarm.find`. Web pages and terminals show it while the arm stays in
+    this mode.
 
     Attributes:
         word: The mode, in capitals.
         reason: Reason for the mode.
         advice: Remedy, for a user at a terminal.
-        order: Order that ends the alarm, "enable" or "reset", for which a page has a button.
+        order: Order that ends the alarm ("enable" or "reset"), for which a page has a button.
             Empty if no order ends the alarm.
-        before: Remedy that has to precede the order, a clause that ends in ", then". Empty if
-            no remedy is needed.
+        before: Remedy that must come before the order, as a clause that ends in ", then". Empty
+            if none is needed.
     """
 
     word: str
@@ -312,25 +309,25 @@ class LifeAlarm(NamedTuple):
         shared: int,
         lost: Sequence[str] = (),
     ) -> "LifeAlarm | None":
-        """Returns the alarm that tells people why an arm does not follow the other arms.
+        """Returns the alarm that explains why an arm is not following the other arms.
 
-        Only an arm under the rule `glide` has alarms. Under this rule, it comes to rest while
-        another arm (peer) is silent. After a fault or a stop, it waits for an order of a person
-        before it follows again. All facts come from the arm's record, the stored result of one
-        control period.
+        Only an arm under the rule `glide` has alarms. Under this rule, it comes to rest while a
+        peer is silent. After a fault or a stop, it waits for a person's order before following
+        again. The alarm is derived from the arm's record.
 
         Args:
-            session: Name of the session, which the advice of the alarm quotes.
-            site: Name of the site, which the advice quotes.
-            mode: Mode of the site, as the record names it.
-            mem: Numbers that the site keeps from tick to tick, the field `mem` of the record.
-                They contain the reason for the mode.
-            shared: Number of coordinates that sites share, by which `mem` is divided.
+            session: Name of the session, which is quoted in the advice.
+            site: Name of the site, which is quoted in the advice.
+            mode: Mode of the site, as named in the record.
+            mem: Internal state of the site (field `mem` of the record), which includes the
+                reason for the mode.
+            shared: Number of coordinates that sites share, which determines how `mem` is
+                divided.
             lost: Names of the peers without which the site continues.
 
         Returns:
-            The alarm. None if the site needs no attention, or if the record is not from a site
-            under this rule.
+            The alarm, or None if the site needs no attention or the record is from a site that
+            does not use this rule.
         """
         try:
             reason = LifeReason(int(mem[2 * shared + 1]))
@@ -359,7 +356,7 @@ _REMEDIES = {
     LifeReason.ARM_SILENT: "let the program of the arm send again, then",
 }
 _ORDERS = {"fault": "reset", "stopped": "enable"}
-"""The order that ends a mode."""
+"""The order that ends each mode."""
 _ALARM_MODES = ("fault", "stopped", "hold")
 _ADVICE = {
     ("stopped", LifeReason.RELEASED): "hold the switch",
@@ -373,11 +370,11 @@ _DEFAULT_ADVICE = "it continues by itself once samples arrive from all its peers
 
 
 def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
-    """Returns the alarm of an arm that continues without lost arms, or None if no arm is lost.
+    """Returns the alarm of an arm that continues without lost peers, or None if none is lost.
 
-    The weight (share) of the lost arm is divided among the other arms (peers). The `word` of
-    the alarm is, for example, "WITHOUT m2". No order is needed, because a lost arm gets its
-    share back automatically when it returns.
+    The weight (share) of the lost peer is divided among the other peers. The `word` of the
+    alarm is, for example, "WITHOUT m2". No order is needed, because a lost peer regains its
+    share automatically when it returns.
 
     Args:
         lost: Names of the lost peers.
@@ -406,28 +403,24 @@ _ACTIVITIES = {
 def describe_mode(
     site: str, output: TickRecord, *, glides: bool, law_failure: Exception | None = None
 ) -> str:
-    """Writes the sentence with which a site reports a change of its mode in the log.
+    """Writes the sentence that a site logs when its mode changes.
 
-    A site is the process that runs one arm, and its peers are the other sites. The sentence
-    states what the arm does, since when, and why, for example "s holds its reference from t =
-    1.250 s: a peer is stale". A peer is stale if no sample has arrived from it for too long.
+    The sentence states what the arm does, since when, and why, for example "s holds its
+    reference from t = 1.250 s: a peer is stale". A peer is stale if no sample has arrived from
+    it for too long.
 
     No reason is given for the modes RETURN and RUN, which follow as soon as samples of all
-    peers arrive, unless the arm returns because a peer was dropped or restored. The sentence
-    about an arm that left its speed limit (DIVERGED) states the speed.
+    peers arrive, unless the arm returns because a peer was dropped or restored. For an arm that
+    exceeded its speed limit (DIVERGED), the sentence states the speed.
 
     Args:
         site: Name of the site.
-        output: Record of the first tick (period of the control loop) in the mode.
-        glides: True if the site is under the rule `glide`, by which an arm comes to rest while
-            a peer is silent. Its record then contains the reason for the mode. Without this
-            rule, the mode can only change because of a stale peer or because the arm diverged.
-        law_failure: Error with which the user's control law failed last, or None. It is given
-            as the reason if the mode is due to this failure. It is only used under the rule
-            `glide`.
-
-    Returns:
-        The sentence.
+        output: Record of the first tick in the new mode.
+        glides: True if the site uses the rule `glide`, where an arm comes to rest while a peer
+            is silent. Its record then contains the reason for the mode. Without this rule, the
+            mode can only change because a peer is stale or the arm diverged.
+        law_failure: The most recent error of the user's control law, or None. Under the rule
+            `glide`, it is stated as the reason if it caused the mode.
     """
     if output.mode is Mode.DIVERGED:
         speed = max(abs(v) for v in output.qd)
@@ -439,7 +432,7 @@ def describe_mode(
     else:
         reason = None
         text = "a peer is stale"
-    # The error of the law says more than the reason that a number is not finite.
+    # The law's error is more informative than the reason that a number is not finite.
     if law_failure is not None and find_life_reason(output) is LifeReason.NOT_FINITE:
         text = str(law_failure)
 

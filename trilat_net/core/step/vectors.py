@@ -1,14 +1,14 @@
 """Defines the types of vectors and arrays that compiled functions use.
 
-A compiled function must not allocate memory for its results, because this takes longer than the
-computation. Therefore short vectors are tuples of numbers, which stay in the registers of the
-processor.
+A compiled function must not allocate memory for its results, because this would take longer
+than the computation itself. Short vectors are therefore tuples of floats, which stay in the
+registers of the processor.
 
 Invariant:
-    - A compiled function reads a vector only by index. Therefore its argument may be a tuple or
-      an array.
+    - A compiled function accesses a vector argument only by index. The argument may therefore
+      be a tuple or an array.
     - A compiled function returns a vector as a tuple. The functions `put_pair` and `put_five`
-      copy a tuple into an array, and `put` copies an array.
+      copy a tuple to an array, and `put` copies an array.
 """
 
 from collections.abc import Sequence
@@ -20,16 +20,16 @@ from numpy.typing import NDArray
 from .jit import leaf
 
 Pair = tuple[float, float]
-"""One number per joint, or per axis of the plane."""
+"""One value per joint, or per axis of the plane."""
 Five = tuple[float, float, float, float, float]
-"""One number per parameter."""
+"""One value per parameter."""
 Vector = Sequence[float] | Any
-"""A vector to read by index: a tuple, or a row of an array."""
+"""A vector that is accessed by index: a tuple, or a row of an array."""
 
 
 @leaf
 def read_pair(a: Vector) -> Pair:
-    """Returns the first two numbers of an array as a tuple.
+    """Returns the first two elements of an array as a tuple.
 
     Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
     control loop.
@@ -39,7 +39,7 @@ def read_pair(a: Vector) -> Pair:
 
 @leaf
 def read_five(a: Vector) -> Five:
-    """Returns the first five numbers of an array as a tuple.
+    """Returns the first five elements of an array as a tuple.
 
     Compiled code keeps a tuple in registers, whereas a new array would allocate memory in the
     control loop.
@@ -49,11 +49,11 @@ def read_five(a: Vector) -> Five:
 
 @leaf
 def put(a: Any, values: Any) -> None:
-    """Copies numbers into an array, one by one, without allocating memory.
+    """Copies values into an array, element by element, without allocating memory.
 
     Args:
-        a: The array, which is changed.
-        values: At least as many numbers as `a` has entries.
+        a: Array to overwrite.
+        values: At least as many values as `a` has elements.
     """
     for i in range(a.shape[0]):
         a[i] = values[i]
@@ -62,14 +62,14 @@ def put(a: Any, values: Any) -> None:
 # No loop is used: indexing a tuple by a loop variable would compile to branches.
 @leaf
 def put_pair(a: Any, values: Pair) -> None:
-    """Overwrites an array of length 2 with two numbers, without allocating memory."""
+    """Overwrites an array of length 2 without allocating memory."""
     a[0] = values[0]
     a[1] = values[1]
 
 
 @leaf
 def put_five(a: Any, values: Five) -> None:
-    """Overwrites an array of length 5 with five numbers, without allocating memory."""
+    """Overwrites an array of length 5 without allocating memory."""
     a[0] = values[0]
     a[1] = values[1]
     a[2] = values[2]
@@ -79,11 +79,11 @@ def put_five(a: Any, values: Five) -> None:
 
 @leaf
 def choose(condition: bool, if_true: float, if_false: float) -> float:
-    """Returns one of two numbers, without a branch in the compiled code.
+    """Returns one of two values, without a branch in the compiled code.
 
-    Both numbers are always computed. With `choose` in place of `if`, a function can also be
-    compiled for several simulations side by side (SIMD), each of which may need a different
-    choice. See `core/lanes`.
+    Both values are always computed. Unlike `if`, `choose` can also be compiled for several
+    simulations side by side (SIMD), each of which may need a different choice. See
+    `core/lanes`.
 
     Args:
         condition: The condition.
@@ -95,17 +95,17 @@ def choose(condition: bool, if_true: float, if_false: float) -> float:
 
 @leaf
 def holds_anywhere(condition: bool) -> bool:
-    """Returns the condition, or for several simulations, True if it holds in any of them.
+    """Returns the condition, or, for several simulations, whether it holds in any of them.
 
     Code that is compiled for several simulations side by side may skip an operation only if
-    none of them needs it, see `choose`.
+    none of them needs it; see `choose`.
     """
     return condition
 
 
 @leaf
 def round_down(number: float) -> float:
-    """Returns the largest whole number that is not above a number: -2.0 for -1.5."""
+    """Rounds a number down to the nearest integer, returned as a float: -2.0 for -1.5."""
     return float(np.floor(number))
 
 
@@ -117,14 +117,14 @@ def whole(number: float) -> int:
 
 @leaf
 def count_started(table: Any, first: int, count: int, now: float) -> int:
-    """Returns how many rows of a table, sorted by time, begin at or before a given time.
+    """Counts the rows of a time-sorted table that start at or before a given time.
 
-    For example, this finds the row of a recorded torque that applies now. The time of a row is
-    its first column, so that bisection finds the count.
+    For example, this finds the row of a recorded torque that applies now. The first column
+    contains the times, and the count is found by bisection.
 
     Args:
         table: The table.
-        first: Index of the first row to search. Rows before it have another purpose.
+        first: Index of the first row to search. Rows before it serve other purposes.
         count: Number of rows to search.
         now: The time, in the unit of the first column.
 
@@ -145,10 +145,10 @@ def count_started(table: Any, first: int, count: int, now: float) -> int:
 Array = NDArray[np.float64]
 
 Row = Any
-"""A row of a structured array without named fields; `row_fields` has types of most rows."""
+"""Row of a structured array without named fields; `row_fields` has types for most rows."""
 
 Points = NDArray[np.int64]
-"""A table of pairs, shape (n, 2), of traces and then of outages.
+"""A table of pairs, shape (n, 2), for traces followed by outages.
 
 A point of a trace consists of the time since the first point, us, and the delay, us, which is
 -1 if the sample is lost. An outage consists of its first stamp and its end, ns.

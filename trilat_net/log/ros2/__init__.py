@@ -49,12 +49,7 @@ __all__ = [
 if TYPE_CHECKING:
     from . import cdr, ros2_messages
     from .cdr import FLOAT64_ARRAY, JOINT_STATE, POSE, STRING, TRANSFORMS
-    from .published import (
-        COMMON_TOPICS,
-        Ros2Topics,
-        SiteMessages,
-        pack_session_diagnostics,
-    )
+    from .published import COMMON_TOPICS, Ros2Topics, SiteMessages, pack_session_diagnostics
     from .robot_model import SPACING_M, WORLD
     from .ros2_messages import (
         EVENTS,
@@ -81,7 +76,7 @@ else:
         __name__,
         {
             "cdr": "FLOAT64_ARRAY JOINT_STATE POSE STRING TRANSFORMS cdr",
-            "published": ("COMMON_TOPICS Ros2Topics SiteMessages pack_session_diagnostics"),
+            "published": "COMMON_TOPICS Ros2Topics SiteMessages pack_session_diagnostics",
             "robot_model": "SPACING_M WORLD",
             "ros2_messages": (
                 "EVENTS FRAMES LINES NUMBERS_BY_MODE_WORD Ros2Channels Ros2SiteChannels "

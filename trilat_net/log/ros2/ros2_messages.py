@@ -24,7 +24,7 @@ from ...core import POSITION
 from ...log import McapWriter, compute_task_errors
 from ...net import MODE_WORDS, Event, LinkStats, State
 from ...records import Mode, TickRecord
-from ...scenario import TASK_AXES, Scenario, describe_event
+from ...scenario import TASK_AXES, Change, Scenario
 from . import cdr
 from .robot_model import RobotModel, name_ros_joints
 
@@ -161,7 +161,7 @@ def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
     Yields:
         For each message, the name of its channel (`EVENTS` or `LINES`) and the encoded message.
     """
-    text = describe_event(event.kind, event.text, event.command)
+    text = Change.describe_event(event.kind, event.text, event.command)
     text_with_member = f"{event.member}: {text}"
     yield EVENTS, cdr.pack_string(text_with_member)
     level = _LEVELS.get(event.kind, cdr.RosLogLevel.INFO)

@@ -1,7 +1,7 @@
-"""Connects this program with ROS 2 programs over their Zenoh network.
+"""Connects this program to ROS 2 (Robot Operating System) programs over their Zenoh network.
 
-ROS 2 is the Robot Operating System. `ros2_graph` publishes and subscribes to topics of ROS
-programs, without a ROS installation, and `ros2_names` checks the names of topics.
+`ros2_graph` publishes and subscribes to topics of ROS programs without a ROS installation, and
+`ros2_names` checks the names of topics.
 """
 
 from typing import TYPE_CHECKING

@@ -1,17 +1,16 @@
-"""Exchanges messages with ROS 2 programs over Zenoh, without an installation of ROS.
+"""Exchanges messages with ROS 2 programs over Zenoh, without a ROS installation.
 
-Zenoh is a library that transports messages over a network. ROS 2 programs that use the
-middleware rmw_zenoh exchange their messages over Zenoh. `Ros2Graph` opens a Zenoh session of
-its own, as a client of ROS's router (rmw_zenohd) or of another Zenoh router, and follows the
-same wire format. ROS programs then see a node with topics and services, as if this program used
-a ROS library.
+ROS 2 programs that use the middleware rmw_zenoh exchange their messages over Zenoh, a library
+that transports messages over a network. `Ros2Graph` opens its own Zenoh session as a client of
+ROS's router (rmw_zenohd) or another Zenoh router, and uses the same wire format. To ROS
+programs it appears as a node with topics and services, as if this program used a ROS library.
 
 The wire format has three elements:
 
-- A key per topic: domain / name / DDS type / hash of the type's definition.
-- An attachment of 33 bytes to each message: its number, the time of sending, and an identifier
-  of the sender.
-- A liveliness token per node and per endpoint, which shows its existence to other programs.
+- One key per topic: domain / name / DDS type / hash of the type's definition.
+- An attachment of 33 bytes per message: the message number, the time of sending, and an
+  identifier of the sender.
+- One liveliness token per node and per endpoint, which announces it to other programs.
 
 Source: ros2/rmw_zenoh, docs/develop/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
 
@@ -21,7 +20,7 @@ Invariant:
     - No part of a ROS name is empty, because a token must not have empty parts.
     - Messages from ROS programs never raise an error in this process. Messages without an
       attachment are counted and skipped.
-    - Publishing never delays the caller. If the network is too slow, messages are dropped.
+    - Publishing never delays the caller. If the network cannot keep up, messages are dropped.
 """
 
 import hashlib
@@ -71,9 +70,9 @@ TYPE_HASHES = {
 }
 """SHA-256 of each type's definition (REP 2016). It is the same from ROS 2 Iron to Lyrical."""
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
-"""Distributions of ROS 2 with which messages can be exchanged."""
+"""ROS 2 distributions with which messages can be exchanged."""
 _NO_HASH = "TypeHashNotSupported"
-"""Text that ROS 2 Humble writes in place of the hash of a message type."""
+"""String that ROS 2 Humble writes in place of the hash of a message type."""
 P = ParamSpec("P")
 _ATTACHMENT = struct.Struct("<qqB16s")
 """Layout of an attachment: number, time of sending, length of the identifier, and identifier.
@@ -84,8 +83,8 @@ _GID_BYTES = 16
 class EndpointKind(StrEnum):
     """Kind of an endpoint of a ROS 2 node: a publisher, a subscription, or a service.
 
-    The value is the text by which the liveliness token of the endpoint states its kind. A
-    liveliness token is a key that shows other programs that the endpoint exists.
+    The value is the string that denotes this kind in the endpoint's liveliness token, a key
+    that announces the endpoint to other programs.
     """
 
     PUBLISHER = "MP"
@@ -94,11 +93,11 @@ class EndpointKind(StrEnum):
 
 
 class QualityOfService(NamedTuple):
-    """Quality of service of a publisher, subscription or service, as ROS 2 defines it.
+    """Quality of service of a publisher, subscription or service, as defined by ROS 2.
 
     Attributes:
-        reliable: True if lost messages are sent again until they arrive.
-        latched: True if late subscribers receive the last messages ("transient local").
+        reliable: True if lost messages are resent until they arrive.
+        latched: True if late subscribers receive the most recent messages ("transient local").
         depth: Number of messages that are kept.
     """
 
@@ -107,10 +106,9 @@ class QualityOfService(NamedTuple):
     depth: int = 10
 
     def encode(self) -> str:
-        """Returns the quality of service as text for a liveliness token.
+        """Encodes the quality of service for use in a liveliness token.
 
-        A liveliness token shows other programs that an endpoint exists. As in ROS 2 itself,
-        values that are the defaults are left out.
+        As in ROS 2 itself, values equal to the defaults are left out.
         """
         reliability = "" if self.reliable else "2"
         durability = "1" if self.latched else ""
@@ -119,9 +117,7 @@ class QualityOfService(NamedTuple):
 
 
 class Attachment(NamedTuple):
-    """Sender, number and time of a message, which ROS 2 programs attach to every Zenoh message.
-
-    Receivers can thus number and time the messages of each sender.
+    """Sender, number and time that ROS 2 programs attach to every Zenoh message.
 
     Attributes:
         number: Number of the message, from 1.
@@ -135,19 +131,19 @@ class Attachment(NamedTuple):
     gid: bytes
 
     def encode(self) -> bytes:
-        """Encodes the number, time and sender of a message as 33 bytes, as ROS 2 expects."""
+        """Encodes the number, time and sender of a message as 33 bytes in the ROS 2 format."""
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
     @classmethod
     def decode(cls, content: Any) -> "Attachment | None":
-        """Reads the number, time and sender that ROS 2 adds to each message over Zenoh.
+        """Decodes the number, time and sender that ROS 2 attaches to each Zenoh message.
 
         Args:
             content: The bytes, or the `ZBytes` object of Zenoh. None if the message has no
                 attachment.
 
         Returns:
-            The attachment. None if there is none, or if it does not have the format of ROS.
+            The attachment, or None if there is none or it is not in the ROS format.
         """
         data = b"" if content is None else bytes(content)
         if len(data) != _ATTACHMENT.size:
@@ -159,7 +155,7 @@ class Attachment(NamedTuple):
 
 
 def find_type_hash(kind: str, distro: str) -> str:
-    """Returns the hash by which a ROS 2 distribution identifies the version of a message type.
+    """Returns the hash that identifies a version of a message type in a ROS 2 distribution.
 
     Args:
         kind: Name of the type, such as "std_msgs/msg/String".
@@ -169,10 +165,10 @@ def find_type_hash(kind: str, distro: str) -> str:
 
 
 def _name_dds_type(kind: str) -> str:
-    """Returns the name of a ROS message type in the notation of DDS.
+    """Returns the name of a ROS message type in DDS notation.
 
     Over Zenoh, ROS uses this notation in the keys of messages, and in the tokens that announce
-    publishers and subscriptions. For "std_msgs/msg/String" it is
+    publishers and subscriptions. For example, "std_msgs/msg/String" becomes
     "std_msgs::msg::dds_::String_".
 
     Args:
@@ -183,13 +179,13 @@ def _name_dds_type(kind: str) -> str:
 
 
 class Ros2Member(NamedTuple):
-    """Address of a ROS 2 node, from which its liveliness tokens are composed.
+    """Address of a ROS 2 node, used to compose its liveliness tokens.
 
-    A liveliness token is a key that shows other programs that a node, or an endpoint of it,
-    exists.
+    A liveliness token is a key that announces a node, or one of its endpoints, to other
+    programs.
 
     Attributes:
-        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
+        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes in other domains are invisible.
         zid: Identity of the node's Zenoh session.
         namespace: Namespace of the node. Empty for the root namespace.
         name: Name of the node.
@@ -201,10 +197,9 @@ class Ros2Member(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the text that shows ROS 2 programs that a node exists.
+        """Returns the liveliness token that announces the node to ROS 2 programs.
 
-        The node exists for them as long as this program declares the text to Zenoh as a
-        liveliness token.
+        The node is visible to them for as long as this program declares the token to Zenoh.
         """
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
@@ -220,12 +215,12 @@ class Ros2Member(NamedTuple):
         """Returns the liveliness token of one publisher, subscription or service of the node.
 
         Args:
-            number: Number of the endpoint, unique in the Zenoh session.
+            number: Number of the endpoint, unique within the Zenoh session.
             end: Kind of the endpoint.
             name: Name of the topic or service.
             kind: Name of its type, such as "std_msgs/msg/String".
             type_hash: Hash of that type, which differs between versions of the type.
-            qos: Quality of service, for example if lost messages are sent again.
+            qos: Quality of service, such as whether lost messages are resent.
         """
         node = f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}"
         return f"{node}/{_mangle('/' + name)}/{_name_dds_type(kind)}/{type_hash}/{qos.encode()}"
@@ -241,7 +236,7 @@ class Ros2Member(NamedTuple):
         return f"{self.domain}/{name}/{_name_dds_type(kind)}/{type_hash}"
 
     def describe_mismatch(self, token: str, kind: str) -> str:
-        """Describes why messages of a publisher do not arrive at a subscription of the node.
+        """Explains why messages from a publisher do not reach a subscription of this node.
 
         Args:
             token: Liveliness token of the publisher.
@@ -263,25 +258,25 @@ class Ros2Member(NamedTuple):
         """Returns the part of liveliness tokens that names the node, "%/NAMESPACE/NAME".
 
         The first % stands for the root enclave, to which security rules may be attached. A node
-        without a namespace has a % in place of the namespace.
+        with no namespace has a % in place of the namespace.
         """
         namespace = _mangle("/" + self.namespace) if self.namespace else "%"
         return f"%/{namespace}/{self.name}"
 
 
 def _mangle(name: str) -> str:
-    """Returns a name as ROS 2 writes it in a token: "/arm/joints" as "%arm%joints".
+    """Returns a name as written in ROS 2 tokens: "/arm/joints" becomes "%arm%joints".
 
-    A token is itself a path whose parts are divided by slashes.
+    This is necessary because a token is itself a path whose parts are separated by slashes.
     """
     return name.replace("/", "%")
 
 
 def make_gid(token: str) -> bytes:
-    """Returns 16 bytes that identify a ROS 2 publisher or subscriber, made from its token.
+    """Derives the 16 bytes that identify a ROS 2 publisher or subscriber from its token.
 
     Args:
-        token: Liveliness token of the endpoint, which no other endpoint has.
+        token: Liveliness token of the endpoint, which is unique.
     """
     return hashlib.sha256(token.encode()).digest()[:_GID_BYTES]
 
@@ -289,33 +284,35 @@ def make_gid(token: str) -> bytes:
 _SETTINGS = {"timestamping": {"enabled": {"client": True}}}
 """Zenoh settings of the session.
 
-Messages need time stamps, by which late subscribers of a latched topic find the last messages.
+Messages need time stamps, which late subscribers of a latched topic use to find the most recent
+messages.
 """
 SENSOR = QualityOfService(reliable=False, depth=5)
 """Quality of service of all subscriptions of this program.
 
 It requests unreliable delivery, which every publisher can provide. ROS would not connect a
-subscription that requests reliable delivery with an unreliable publisher.
+subscription that requests reliable delivery to an unreliable publisher.
 """
 
 
 _MAX_REASONS = 64
 """Number of reasons that are counted separately.
 
-It is limited because reasons contain texts from other programs, which may differ every time.
+The number is limited because reasons contain text from other programs, which may differ every
+time.
 """
 
 
 class Refusals:
-    """Counts messages from ROS programs that could not be used, by the reason.
+    """Counts the messages from ROS programs that could not be used, grouped by reason.
 
-    A faulty ROS program therefore cannot stop this process, and the user sees what is wrong.
+    A faulty ROS program therefore cannot stop this process, and the user is told what is wrong.
 
     Args:
         report: Function that receives a sentence when a reason occurs for the first time.
 
     Attributes:
-        counts: Number of refusals by the reason.
+        counts: Mapping from reason to number of rejected messages.
     """
 
     def __init__(self, report: Callable[[str], None]) -> None:
@@ -324,12 +321,12 @@ class Refusals:
         self._lock = threading.Lock()
 
     def add(self, reason: str) -> None:
-        """Counts a refused message, and tells the user when a reason occurs for the first time.
+        """Counts a rejected message, and informs the user when a reason first occurs.
 
-        The method may be called in any thread.
+        Safe to call from any thread.
 
         Args:
-            reason: Why the message was refused.
+            reason: Why the message was rejected.
         """
         with self._lock:
             if reason not in self.counts and len(self.counts) >= _MAX_REASONS:
@@ -340,22 +337,21 @@ class Refusals:
             self._report(f"refused: {reason}")
 
     def guard(self, topic: str, act: Callable[P, None]) -> Callable[P, None]:
-        """Wraps a function that processes messages, so that its errors count as refusals.
+        """Wraps a function that processes messages, counting its errors as rejected messages.
 
         Args:
-            topic: Name of the topic of the messages, with which each reason for a refusal
-                begins.
+            topic: Name of the topic of the messages, which is put in front of each reason.
             act: Function that processes a message. It raises ValueError or TrilatError to
-                refuse the message.
+                reject the message.
 
         Returns:
-            A function with the same arguments, which does not raise these errors.
+            A function with the same arguments that does not raise these errors.
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
-            """Passes a message to `act`, and counts it as refused if `act` raises an error.
+            """Passes a message to `act`, and counts it as rejected if `act` raises an error.
 
-            Without this, the error would be lost in a thread of Zenoh, where nobody sees it.
+            Otherwise, the error would go unnoticed in a thread of Zenoh.
             """
             try:
                 act(*args, **named)
@@ -366,15 +362,15 @@ class Refusals:
 
 
 class TopicPublisher:
-    """Publishes messages on one ROS 2 topic, so that ROS programs can subscribe to it.
+    """Publishes messages on one ROS 2 topic, to which ROS programs can subscribe.
 
-    `Ros2Graph.publisher` creates it.
+    Created by `Ros2Graph.publisher`.
 
     Args:
         declared: The publisher object of Zenoh.
         gid: 16 bytes that identify the publisher to ROS 2 programs, see `make_gid`.
         clock: Clock for the times of sending.
-        latched: True if late subscribers receive the last messages.
+        latched: True if late subscribers receive the most recent messages.
     """
 
     def __init__(
@@ -385,7 +381,7 @@ class TopicPublisher:
         *,
         latched: bool,
     ) -> None:
-        """Stores a publisher of a ROS 2 topic, whose messages are numbered from 1."""
+        """Stores a publisher for a ROS 2 topic, whose messages are numbered from 1."""
         self._declared = declared
         self._gid = gid
         self._clock = clock
@@ -394,9 +390,9 @@ class TopicPublisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """True if somebody would receive a message, so that it is worth composing a message.
+        """True if a message would be received by anyone, and is therefore worth composing.
 
-        It is always true for a latched topic, whose last message later subscribers receive.
+        Always True for a latched topic, whose last message is delivered to later subscribers.
         """
         return self._latched or bool(self._declared.matching_status.matching)
 
@@ -404,7 +400,7 @@ class TopicPublisher:
         """Publishes a message on the topic, with the next number and the time of sending.
 
         Args:
-            data: The message, encoded in CDR, the binary format of ROS 2.
+            data: The message, encoded in CDR (the binary format of ROS 2).
         """
         self._number += 1
         attachment = Attachment(self._number, self._clock.unix_ns(), self._gid)
@@ -421,22 +417,22 @@ ROUTER_ADVICE = (
 class Ros2Graph:
     """A ROS 2 node of this program, with its publishers, subscriptions and services.
 
-    The bridge creates one object for each session. The object is a context manager that removes
-    the node at its end.
+    The bridge creates one node per session. Use it as a context manager to remove the node at
+    the end.
 
     Args:
-        refusals: Counts the messages that are refused.
+        refusals: Counts the rejected messages.
         routers: Endpoints of the router of ROS. The first one that answers is used.
         namespace: Namespace of the node.
         name: Name of the node.
         clock: Clock for the times of sending.
-        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
+        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes in other domains are invisible.
         distro: Distribution of ROS 2, one of `DISTROS`. It determines the format of type
             hashes.
 
     Raises:
         RouterSilent: No router answers (yet).
-        UsageError: An endpoint is not valid, or belongs to a program that is not a router.
+        UsageError: An endpoint is invalid, or belongs to a program that is not a router.
     """
 
     def __init__(
@@ -495,18 +491,17 @@ class Ros2Graph:
     def connected(self) -> bool:
         """True while this program is connected to the Zenoh router of ROS 2.
 
-        It may be False for some time if the router is restarted, until the connection is
-        restored.
+        If the router is restarted, this is False until the connection is restored.
         """
         return bool(self._session.info.routers_zid())
 
     def publisher(self, topic: str, kind: str, qos: QualityOfService) -> TopicPublisher:
-        """Creates a publisher of a topic, and announces it to ROS programs.
+        """Creates a publisher for a topic, and announces it to ROS programs.
 
         Args:
             topic: Name of the topic.
             kind: Name of the message type.
-            qos: Quality of service, for example if lost messages are sent again.
+            qos: Quality of service, such as whether lost messages are resent.
 
         Returns:
             The publisher, which sends messages that are encoded in CDR.
@@ -530,16 +525,17 @@ class Ros2Graph:
     ) -> None:
         """Subscribes to a topic, and announces the subscription to ROS programs.
 
-        ROS tools such as `ros2 topic info` then list the subscription. Messages of a publisher
-        that uses another ROS domain, another message type or another version of the type do
-        not arrive. The user is told once about each such publisher, see `Refusals`.
+        The subscription is then listed by ROS tools such as `ros2 topic info`. Messages do not
+        arrive from a publisher that uses another ROS domain, another message type or another
+        version of the type. The user is informed once about each such publisher, see
+        `Refusals`.
 
         Args:
             topic: Name of the topic.
             kind: Name of the message type.
-            receive: Function that receives the payload and the attachment of each message. It
-                is called in a thread of Zenoh. If it raises an error, the message counts as
-                refused.
+            receive: Function that receives the payload and attachment of each message. It is
+                called in a thread of Zenoh. If it raises an error, the message counts as
+                rejected.
         """
         self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
         self._report_mismatches(topic, kind)
@@ -559,9 +555,9 @@ class Ros2Graph:
     def _report_mismatches(self, topic: str, kind: str) -> None:
         """Reports the publishers of a topic whose messages cannot be received here.
 
-        Every publisher of ROS has a liveliness token, a Zenoh key that states its domain, topic
+        Every ROS publisher has a liveliness token, a Zenoh key that states its domain, topic
         and message type. The tokens of all publishers of the topic are observed, including
-        those that exist already.
+        those that already exist.
 
         Args:
             topic: Name of the topic.
@@ -569,10 +565,10 @@ class Ros2Graph:
         """
 
         def check_publisher(token: zenoh.Sample) -> None:
-            """Counts a refusal if a publisher appears whose messages this node cannot receive.
+            """Counts a rejection when a publisher appears that this node cannot receive.
 
-            Zenoh calls it with a token for each publisher that appears or disappears. A
-            mismatch is, for example, another message type under the name of the topic.
+            Zenoh calls this function with the token of each publisher that appears or
+            disappears. A mismatch is, for example, another message type on the same topic.
             """
             has_appeared = token.kind == zenoh.SampleKind.PUT
             mismatch = self._node.describe_mismatch(str(token.key_expr), kind)
@@ -588,12 +584,12 @@ class Ros2Graph:
     def tap(self, topic: str, receive: Callable[[str, Attachment], None]) -> None:
         """Receives the messages of a topic, of any type, without being listed as a subscriber.
 
-        The subscription is not announced to ROS, so ROS tools do not show it.
+        The subscription is not announced to ROS and does not show up in ROS tools.
 
         Args:
             topic: Name of the topic.
-            receive: Function that receives the type and the attachment of each message, in a
-                thread of Zenoh.
+            receive: Function that receives the type and attachment of each message, in a thread
+                of Zenoh.
         """
 
         def receive_sample(sample: zenoh.Sample, attachment: Attachment) -> None:
@@ -605,16 +601,16 @@ class Ros2Graph:
     def _declare_subscriber(
         self, key: str, topic: str, receive: Callable[[zenoh.Sample, Attachment], None]
     ) -> None:
-        """Creates a Zenoh subscriber that refuses messages without an attachment.
+        """Creates a Zenoh subscriber that rejects messages without an attachment.
 
         Args:
             key: Zenoh key, which may contain wildcards.
-            topic: Name of the topic, for the reasons of refusals.
-            receive: Function that receives each other message.
+            topic: Name of the topic, for the reasons given when messages are rejected.
+            receive: Function that receives all other messages.
         """
 
         def receive_sample(sample: zenoh.Sample) -> None:
-            """Passes a ROS 2 program's message to `receive`, and refuses other messages."""
+            """Passes messages from ROS 2 programs to `receive`, and rejects all others."""
             attachment = Attachment.decode(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
@@ -628,18 +624,18 @@ class Ros2Graph:
         """Offers a service to ROS programs.
 
         The requests of all services are processed one after another in a separate thread, so
-        `answer` may take time.
+        `answer` may take a while.
 
         Args:
             service: Name of the service.
             kind: Name of its type, such as "std_srvs/srv/Trigger".
             answer: Function that receives a request and returns the response, both encoded in
-                CDR, the binary format of ROS 2.
+                CDR (the binary format of ROS 2).
         """
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
-            """Computes and sends the response to a request (service call) of a ROS program."""
+            """Computes and sends the response to a ROS program's request (service call)."""
             # A query ends for its sender only when the query object is dropped.
             with query:
                 request = Attachment.decode(query.attachment)
@@ -664,8 +660,8 @@ class Ros2Graph:
     ) -> tuple[str, bytes]:
         """Announces a publisher, subscription or service to ROS programs.
 
-        It is announced by a liveliness token, a Zenoh key that exists as long as this program
-        is connected.
+        The announcement is a liveliness token, a Zenoh key that exists while this program is
+        connected.
 
         Args:
             end: Kind of the endpoint.
@@ -674,7 +670,7 @@ class Ros2Graph:
             qos: Quality of service.
 
         Returns:
-            The Zenoh key of the endpoint, and 16 bytes that identify it.
+            The Zenoh key of the endpoint, and the 16 bytes that identify it.
         """
         self._endpoints += 1
         type_hash = find_type_hash(kind, self._distro)

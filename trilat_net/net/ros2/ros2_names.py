@@ -1,7 +1,7 @@
 """Checks the names of ROS 2 topics, services and nodes before they are used.
 
-Other ROS programs could not subscribe to a topic, or call a service, with a name that ROS 2
-does not accept. Such a name is therefore refused with an explanation.
+A name that ROS 2 does not accept is rejected with an explanation, because other ROS programs
+could neither subscribe to such a topic nor call such a service.
 """
 
 import re
@@ -16,17 +16,14 @@ Each part consists of letters, digits and _, and does not start with a digit.
 
 
 def check_ros_name(name: str, kind: str) -> str:
-    """Checks that a string is a valid name of ROS 2.
+    """Returns a ROS 2 name without its leading slash, or raises UsageError if it is invalid.
 
     Args:
         name: The name, which may begin with a slash.
-        kind: What the name denotes, such as "topic", for the error message.
-
-    Returns:
-        The name without the leading slash.
+        kind: What the name refers to, such as "topic", for the error message.
 
     Raises:
-        UsageError: The name is not valid.
+        UsageError: The name is invalid.
     """
     relative_name = name.removeprefix("/")
     if not _NAME.fullmatch(relative_name):

@@ -1,9 +1,9 @@
-"""Exports a log as a folder of CSV files, with one file per table.
+"""Exports a log as a folder of CSV files, one file per table.
 
-A table contains, for instance, the records of one arm, with a row per period of its control
-loop. A file has a line of column names and then a line per row. Numbers are written with as
-many digits as Python needs to read them back unchanged. A missing value is an empty field. Two
-more files describe the columns and contain the scenario.
+A table contains, for instance, the records of one arm, with one row per tick. Each file starts
+with a line of column names. Numbers are written with as many digits as Python needs to read
+them back unchanged, and a missing value is an empty field. Two more files contain the
+descriptions of the columns and the scenario.
 """
 
 import csv
@@ -13,16 +13,16 @@ from ...log import Log, Table
 from ..export import ExportFormat, Written, write_table_files
 
 _ROWS_AT_ONCE = 4096
-"""Number of rows that are converted to text at a time, which limits the memory."""
+"""Number of rows converted to text at a time, to limit memory use."""
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:
     """Exports a log as CSV tables in a folder, with their description and the scenario.
 
     Args:
-        log: Log of the run that is exported.
-        folder: Existing folder of the files.
-        written: Function that is called with the number of records written since its last call.
+        log: Log of the run to export.
+        folder: Existing folder for the files.
+        written: Function that is called with the number of records written since the last call.
     """
     write_table_files(log, folder, written, ".csv", _write_table)
 

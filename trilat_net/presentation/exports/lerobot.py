@@ -1,27 +1,26 @@
-"""Exports logs as a dataset of LeRobot, version 3.0, for learning from demonstrations.
+"""Exports logs as a LeRobot dataset, version 3.0, for learning from demonstrations.
 
-LeRobot trains programs to move robots as people did. A dataset is a sequence of frames at a
-fixed rate, divided into episodes. A frame contains the state of the slave arm, the pose of
-every user's arm, the dominance factors of the users (the weights with which the slave follows
-them), the ages of the samples with which the sites follow each other, and, in a run with a
-program, whether a person intervened instead of the program.
+LeRobot trains programs to control robots by imitating people. A dataset is a sequence of frames
+at a fixed rate, divided into episodes. Each frame contains the state of the slave arm, the pose
+of every user's arm, the dominance factors of the users, the ages of the samples that the sites
+use to follow each other, and, in a run with a program, whether a person intervened.
 
 Invariant:
-    - A frame has the newest record of every site at or before its time. A record is the stored
-      result of one period of the control loop of the arm. Nothing is interpolated.
-    - A frame is left out if such a record is older than the period of the site's control loop
-      and also older than the period of the frames. In that case the episode ends, and the next
-      episode begins after the gap.
-    - Observations and actions are states of a site at the time of the frame, from the site's
-      own records. Link delays therefore affect only the samples of peers. The features `age_s`
-      are the ages of these samples.
-    - Numbers are float32. An orientation consists of six numbers, which never jump (see
+    - A frame contains, for every site, the most recent record at or before the time of the
+      frame. Nothing is interpolated.
+    - A frame is dropped if such a record is older than both the control period of the site and
+      the frame period. In that case the episode ends, and the next one begins after the gap.
+    - Observations and actions are states of a site at the time of the frame, taken from the
+      site's own records. Link delays therefore affect only the samples of peers. The features
+      `age_s` are the ages of these samples.
+    - Numbers are float32. An orientation is stored as six numbers, which never jump (see
       `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
       plugin `lerobot_robot_trilat`, so that a trained program can command the plugin. With
-      `observations=plugin`, the observations also have the names and units of the plugin. A
+      `observations=plugin`, observations also have the names and units used by the plugin. A
       test compares them.
-    - There is a column `intervention` only if a program moves the arm of a user in some log.
+    - The column `intervention` exists only if a program moves the arm of a user in at least one
+      of the logs.
 """
 
 import json
@@ -95,32 +94,33 @@ _INDEX_TABLE = {
     "columns": [_INDEX],
 }
 _PANDAS = {"pandas": json.dumps(_INDEX_TABLE)}
-"""Metadata that make pandas, which LeRobot uses, read the texts of tasks as an index."""
+"""Metadata that make pandas, which LeRobot uses, read the task descriptions as an index."""
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
-"""Quantiles that LeRobot expects among the statistics of a feature."""
+"""Quantiles that LeRobot expects in the statistics of a feature."""
 ACTIONS = ("tip", "joints")
-"""Kinds of actions: positions of the end effector, or joint angles.
+"""Kinds of actions: end effector positions, or joint angles.
 
-These are also the modes of the LeRobot plugin that moves an arm to a position. Without the
-setting, actions are the values that the sites exchange.
+These are also the modes of the LeRobot plugin that moves an arm to a position. If the setting
+is omitted, actions are the values that the sites exchange.
 """
 OBSERVATIONS = ("slave", "reference", "plugin")
 """Kinds of observations.
 
-The kinds are the slave's joints, these joints with the reference that the slave follows, or the
-observation of the LeRobot plugin.
+These are the joints of the slave, the same joints with the reference that the slave follows,
+and the observation of the LeRobot plugin.
 """
 EPISODES = ("log", "marks")
-"""Divisions into episodes: one for each log, or by the marks of `session.episode`."""
+"""Ways to divide runs into episodes: one per log, or by the marks set with `session.episode`.
+"""
 SWITCHES = ("no", "yes")
 NO_PROGRAM = "none"
 """Value of the setting `program` for runs in which no program moves an arm."""
 _EPISODE_MARK = re.compile(r"episode (.+) (begins|ended|succeeded|failed)", re.DOTALL)
 _OUTCOMES = {"succeeded": True, "failed": False}
 Names = dict[str, list[str]]
-"""Names of the components of each feature."""
+"""Mapping from feature name to the names of its components."""
 Columns = dict[str, NDArray[Any]]
-"""Columns of frames by the names of their features, shape (F, n) or (F,)."""
+"""Mapping from feature name to its values in all frames, shape (F, n) or (F,)."""
 
 
 class _Feature(NamedTuple):
@@ -140,13 +140,13 @@ class _Feature(NamedTuple):
 class _Attempt(NamedTuple):
     """A part of a run that becomes an episode of the dataset: one attempt at a task.
 
-    Marks that a program sets with `session.episode` enclose the part.
+    Its start and end are marked by a program with `session.episode`.
 
     Attributes:
         name: Name of the episode. Empty for a run without marks.
-        begin_ns: First time of the part, in ns since the start of the session.
-        end_ns: Time after the part. `None` if it lasts until the end of the log.
-        succeeded: Whether the task was done. `None` if no mark states the outcome.
+        begin_ns: Start of the attempt, in ns since the start of the session.
+        end_ns: End of the attempt (exclusive). `None` if it lasts until the end of the log.
+        succeeded: Whether the task was completed. `None` if no mark states the outcome.
     """
 
     name: str
@@ -156,17 +156,17 @@ class _Attempt(NamedTuple):
 
 
 class _Frames(NamedTuple):
-    """The F frames of a data set, each of which refers to a record of every site.
+    """The F frames of a dataset, each of which refers to one record per site.
 
     The frames are equally spaced in time, except at gaps between episodes.
 
     Attributes:
-        rows: For each site, the index of each frame's record in the log, shape (F,).
-        episode: Number of each frame's episode, from 0, shape (F,).
-        left_out: Number of frames that are left out, because they lie in gaps.
-        outside: Number of frames that are left out, because they lie outside the attempts.
-        attempts: Parts of the run that contain the frames.
-        attempt: Index of each frame's part, shape (F,).
+        rows: For each site, the record index of each frame in the log, shape (F,).
+        episode: Episode number of each frame, starting from 0, shape (F,).
+        left_out: Number of frames dropped because they lie in gaps.
+        outside: Number of frames dropped because they lie outside the attempts.
+        attempts: Attempts that contain the frames.
+        attempt: Index of each frame's attempt, shape (F,).
     """
 
     rows: dict[str, Ints]
@@ -201,26 +201,26 @@ def _write(
     task: str = "",
     episodes: str = "log",
 ) -> str:
-    """Exports logs as one LeRobot dataset, with which robot policies are trained.
+    """Exports logs as one LeRobot dataset for training robot policies.
 
-    An episode of the dataset is one run, or an attempt within a run.
+    An episode of the dataset is one run, or one attempt within a run.
 
     Args:
         logs: The logs, at least one.
         folder: Folder of the dataset.
         written: Function that is called with the number of records of every log.
         fps: Number of frames per second.
-        program: Name of the user that is the program, or `NO_PROGRAM`. Empty to find it in
-            each log.
-        actions: Kind of the actions, one of `ACTIONS`. If empty, the actions are those of the
-            plugin if the observations are, and otherwise the values that sites exchange.
+        program: Name of the user that is the program, or `NO_PROGRAM`. Empty to determine it
+            for each log.
+        actions: Kind of the actions, one of `ACTIONS`. If empty, the plugin's actions for
+            plugin observations, and otherwise the values that the sites exchange.
         observations: Kind of the observations, one of `OBSERVATIONS`.
-        site: Name of the user whose arm the plugin will move. If empty, it is the program, or
-            without a program the last user.
+        site: Name of the user whose arm the plugin will move. If empty, the program or, without
+            a program, the last user.
         environment_state: "yes" to store the observation also under the name
-            `observation.environment_state`, without which some policies do not work.
-        task: Text of the task. Empty for the title of the scenario.
-        episodes: Division into episodes, one of `EPISODES`.
+            `observation.environment_state`, which some policies require.
+        task: Description of the task. Empty for the title of the scenario.
+        episodes: How runs are divided into episodes, one of `EPISODES`.
 
     Returns:
         A sentence about the size of the dataset.
@@ -350,25 +350,25 @@ def _write(
 
 
 def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Checks that a setting has one of the possible values.
+    """Raises UsageError if a setting does not have one of its possible values.
 
     Args:
         name: Name of the setting.
-        value: Its value.
+        value: Value of the setting.
         choices: The possible values.
 
     Raises:
-        UsageError: The value is not possible.
+        UsageError: The value is not one of the choices.
     """
     if value not in choices:
         raise UsageError(f"{name} must be {' or '.join(choices)}, not {value!r}")
 
 
 def _choose_plugin_site(log: Log, settings: _Settings) -> str:
-    """Chooses the user's arm that the LeRobot plugin, a learnt policy, will move later.
+    """Chooses the user whose arm the LeRobot plugin, a learnt policy, will move later.
 
-    The settings may name the user. Otherwise the arm of the program is chosen, or without a
-    program the arm of the last user.
+    This is the user named in the settings, otherwise the program or, without a program, the
+    last user.
 
     Args:
         log: Log of a run with at least one user.
@@ -387,16 +387,16 @@ def _choose_plugin_site(log: Log, settings: _Settings) -> str:
 
 
 def _find_attempts(log: Log) -> list[_Attempt]:
-    """Finds the episodes that the user has marked in a log while the session was running.
+    """Finds the episodes that the user marked during the session.
 
-    `session.episode` writes a mark at the beginning and at the end of an episode. An episode
-    without a mark at its end lasts until the next episode begins.
+    `session.episode` writes a mark at the start and at the end of an episode. An episode
+    without an end mark lasts until the next episode begins.
 
     Args:
         log: Log of the run.
 
     Returns:
-        The episodes in their order in time. Empty if there are none.
+        The episodes in chronological order. Empty if there are none.
     """
     episode_marks = []
     for event in log.events:
@@ -420,7 +420,7 @@ def _find_attempts(log: Log) -> list[_Attempt]:
 
 
 def _find_successes(frames: _Frames) -> NDArray[np.bool_]:
-    """Marks the frames at which an attempt ends with success, shape (F,)."""
+    """Returns a mask of the frames at which an attempt ends with success, shape (F,)."""
     succeeded = np.array([attempt.succeeded is True for attempt in frames.attempts])
     is_last = np.diff(frames.attempt, append=len(frames.attempts)) != 0
     successes: NDArray[np.bool_] = is_last & succeeded[frames.attempt]
@@ -428,11 +428,11 @@ def _find_successes(frames: _Frames) -> NDArray[np.bool_]:
 
 
 def _write_json(folder: Path, files: dict[str, Any]) -> None:
-    """Writes the JSON files of a LeRobot dataset into its folder.
+    """Writes the JSON files of a LeRobot dataset to its folder.
 
     Args:
         folder: The folder.
-        files: Contents of the files by name.
+        files: Mapping from file name to contents.
     """
     for file_name, content in files.items():
         text = json.dumps(content, indent=4) + "\n"
@@ -441,10 +441,10 @@ def _write_json(folder: Path, files: dict[str, Any]) -> None:
 
 
 def _describe_session(log: Log, frames: _Frames, program: str) -> dict[str, Any]:
-    """Returns the facts about a log that the manifest of a dataset states.
+    """Returns the facts about a log that are stored in the manifest of a dataset.
 
-    The facts are the session and its scenario, the program that moved an arm, the marked
-    episodes with their outcomes, and the number of frames that were left out.
+    These are the session and its scenario, the program that moved an arm, the marked episodes
+    with their outcomes, and the number of dropped frames.
     """
     outcomes = {True: "succeeded", False: "failed", None: "not stated"}
     episodes = []
@@ -469,7 +469,7 @@ def _number_frames(dataset: Columns, fps: int) -> list[int]:
     marked as done.
 
     Args:
-        dataset: Columns of all frames, to which columns are added.
+        dataset: Columns of all frames, to which the new columns are added.
         fps: Number of frames per second.
 
     Returns:
@@ -494,19 +494,19 @@ def _number_frames(dataset: Columns, fps: int) -> list[int]:
 
 
 def _choose_frames(log: Log, fps: int, attempts: list[_Attempt]) -> _Frames:
-    """Chooses the times of the frames of a log, and the records of each frame.
+    """Chooses the times of the frames of a log, and the record of each site for each frame.
 
     The first frame is at the first time for which every site has a record. Records of a site
     that has diverged are not used.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         fps: Number of frames per second.
-        attempts: Parts of the run whose frames are chosen, in the order of their times.
+        attempts: Parts of the run from which frames are taken, in chronological order.
 
     Raises:
-        LogError: A site has no records, or there is no time for which every site has a record,
-            or no such time in an attempt.
+        LogError: A site has no records, or there is no time (in the log or in an attempt) for
+            which every site has a record.
     """
     rows = {}
     for site in log.sites:
@@ -581,18 +581,18 @@ def _read_columns(
     rows: dict[str, Ints],
     settings: _Settings,
 ) -> tuple[Columns, Names]:
-    """Returns the features of all frames of a log that follow from its records.
+    """Returns the features of all frames of a log that are derived from its records.
 
     A feature is a vector per frame, such as the state of the slave.
 
     Args:
-        log: Log of the run that is exported.
-        rows: For each site, the index of each frame's record, shape (F,).
+        log: Log of the run to export.
+        rows: For each site, the record index of each frame, shape (F,).
         settings: Settings of the export, with the program of this log.
 
     Returns:
-        The columns of the features, and the names of the components of each vector. Without a
-        program, the column `intervention` is false.
+        The columns of the features, and the component names of each vector. Without a program,
+        the column `intervention` is false.
 
     Raises:
         LogError: The log has no slave or no user, or the users have no common action.
@@ -670,18 +670,18 @@ def _read_columns(
 def _read_sample_ages(
     log: Log, rows: dict[str, Ints], slave: str, users: Sequence[str]
 ) -> list[_Feature]:
-    """Returns the ages of the messages with which the slave and its users follow each other.
+    """Returns the ages of the samples with which the slave and its users follow each other.
 
-    The age of a message (sample) is the delay that a control loop experiences. A trained
-    program may need it to judge how old its view of the other arm is. The feature `age_s`
-    contains the ages at the slave, one per user. The feature `age_s.USER` contains the age of
-    the slave's message at a user. Sites that do not follow each other have no such feature.
+    The age of a sample is the delay that a control loop experiences. A trained program may need
+    it to judge how outdated its view of the other arm is. The feature `age_s` contains the ages
+    at the slave, one per user, and `age_s.USER` contains the age of the slave's sample at a
+    user. Sites that do not follow each other have no such feature.
 
     Args:
-        log: Log of the run that is exported.
-        rows: For each site, the index of each frame's record, shape (F,).
+        log: Log of the run to export.
+        rows: For each site, the record index of each frame, shape (F,).
         slave: Name of the slave.
-        users: Names of the sites of the users.
+        users: Names of the users' sites.
     """
     features = []
     followed_users = [user for user in users if user in log[slave].used]
@@ -700,13 +700,13 @@ def _read_ages(log: Log, receiver: str, sender: str) -> Array:
     """Returns the age of the sample in use at each record of the receiver, in s, shape (K,).
 
     Before the first sample, the age is the time since the start of the session, as for a
-    program that moves an arm (`PeerView`). NaN is not used, because statistics with NaN are
-    NaN.
+    program that moves an arm (`PeerView`). NaN is not used, because it would make all
+    statistics NaN.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         receiver: Name of the site that receives samples.
-        sender: Name of its peer that sends them.
+        sender: Name of the peer that sends them.
     """
     records = log[receiver]
     ages_or_nan_s = records.age_s(sender, log[sender].rate_hz)
@@ -718,16 +718,16 @@ def _read_ages(log: Log, receiver: str, sender: str) -> Array:
 def _read_reference(log: Log, slave: str, rows: Ints) -> tuple[Array, list[str]]:
     """Returns the pose that the slave arm follows in each frame, with its component names.
 
-    A learning program takes this reference q_des as the action of the demonstrator.
+    A learning program uses this reference q_des as the action of the demonstrator.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         slave: Name of the slave.
-        rows: Index of each frame's record of the slave, shape (F,).
+        rows: Record index of the slave in each frame, shape (F,).
 
     Returns:
-        The reference, shape (F, n), and the joints, or in task space the axes and the entries
-        of the rotation matrix.
+        The reference, shape (F, n), and the names of the joints or, in task space, of the axes
+        and the entries of the rotation matrix.
     """
     reference = log[slave].q_des[rows]
     if not log[slave].layout.task:
@@ -743,22 +743,22 @@ def _read_commands(
     rows: dict[str, Ints],
     actions: str,
 ) -> tuple[list[Array], list[str]]:
-    """Returns the commands of every user, which a learning program takes as the actions.
+    """Returns the commands of every user, which a learning program uses as actions.
 
-    A user commands the robot by moving a master arm. The commands are therefore the positions
-    of its end effector, the poses that the sites exchange, or its joint angles.
+    A user commands the robot by moving a master arm, so the commands are the positions of its
+    end effector, the poses that the sites exchange, or its joint angles.
 
     Args:
-        log: Log of the run that is exported.
-        users: Names of the sites of the users.
-        rows: For each site, the index of each frame's record, shape (F,).
+        log: Log of the run to export.
+        users: Names of the users' sites.
+        rows: For each site, the record index of each frame, shape (F,).
         actions: Kind of the actions, one of `ACTIONS`, or empty.
 
     Returns:
-        The commands of each user, shape (F, n), and the names of their n components.
+        The commands of each user, shape (F, n), and the names of the n components.
 
     Raises:
-        LogError: The users' arms have different joints, so the users have no common action.
+        LogError: The arms of the users have different joints, so there is no common action.
     """
     if actions == "tip":
         positions = []
@@ -806,16 +806,16 @@ def _read_commands(
 def _write_tables(
     folder: Path, dataset: Columns, starts: Sequence[int], tasks: list[str]
 ) -> dict[str, Any]:
-    """Writes the frames and episodes of a dataset as Parquet files, as LeRobot requires.
+    """Writes the frames and episodes of a dataset as Parquet files in LeRobot's layout.
 
     Args:
         folder: Folder of the dataset.
         dataset: Columns of all frames.
         starts: Index of the first frame of each episode.
-        tasks: Texts of the tasks.
+        tasks: Task descriptions.
 
     Returns:
-        Statistics of the dataset, as contents of a JSON file.
+        Statistics of the dataset, for storage in a JSON file.
     """
     pa = import_extra("pyarrow", *_EXTRA[1:])
     parquet = import_extra(*_EXTRA)
@@ -856,15 +856,14 @@ def _write_tables(
 def _describe_dataset(
     fps: int, names: Names, columns: Columns, episodes: int, tasks: int
 ) -> dict[str, Any]:
-    """Returns the contents of meta/info.json, the file that describes a LeRobot data set.
+    """Returns the contents of meta/info.json, the file that describes a LeRobot dataset.
 
-    LeRobot is a library for learning from demonstrations of robots. LeRobot reads from this
-    file how many episodes there are, where they are stored, and which features each frame
-    contains.
+    The file states how many episodes there are, where they are stored, and which features each
+    frame contains.
 
     Args:
         fps: Number of frames per second.
-        names: Names of the components of each feature.
+        names: Component names of each feature.
         columns: Columns of all frames.
         episodes: Number of episodes.
         tasks: Number of tasks.
@@ -897,13 +896,13 @@ def _describe_dataset(
 def _describe_episode(
     dataset: Columns, first: int, end: int, tasks: list[str]
 ) -> dict[str, Any]:
-    """Returns the table row of one episode: its frames, its length and its task.
+    """Returns the table row of an episode: its frames, its length and its task.
 
     Args:
         dataset: Columns of all frames.
         first: Index of the first frame of the episode.
-        end: Index after its last frame.
-        tasks: Texts of the tasks.
+        end: Index after the last frame.
+        tasks: Task descriptions.
     """
     task_index = dataset["task_index"][first]
     row: dict[str, Any] = {
@@ -926,16 +925,15 @@ def _describe_episode(
 
 
 def _compute_statistics(column: NDArray[Any]) -> dict[str, list[float]]:
-    """Computes the statistics of a feature with which LeRobot normalises it.
+    """Computes the statistics that LeRobot uses to normalise a feature.
 
-    LeRobot is a library for learning from demonstrations. Features of different magnitude are
-    normalised before training.
+    Features are normalised before training, because they differ in magnitude.
 
     Args:
         column: Feature in F frames, shape (F, n) or (F,).
 
     Returns:
-        Each statistic by name, with n values.
+        Mapping from the name of each statistic to its n values.
     """
     frame_rows = column.reshape(len(column), -1).astype(np.float64)
     statistics = {

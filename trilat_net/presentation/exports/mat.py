@@ -1,10 +1,9 @@
-"""Exports a log as a MATLAB file (.mat) with a struct per arm and an array per column.
+"""Exports a log as a MATLAB file (.mat) with one struct per arm and one array per column.
 
-For example, `m1.q1_rad` contains the angle of the first joint of the arm m1 in each period of
-its control loop, and `m1.link.age_s_us` is a column of the statistics of its network
-connections. The struct `events` contains the events of the session. The text `about_json`
-describes all columns, and the text `scenario_toml` is the scenario, the description of the
-experiment.
+For example, `m1.q1_rad` contains the angle of the first joint of arm m1 at every tick, and
+`m1.link.age_s_us` is a column of its link statistics. The struct `events` contains the session
+events. The string `about_json` describes all columns, and the string `scenario_toml` is the
+scenario.
 """
 
 from pathlib import Path
@@ -19,7 +18,7 @@ from ..export import ExportFormat, Written, name_inside, store_tables
 
 _EXTRA = ("scipy.io", "mat", "MAT files")
 _MAX_EXACT_INTEGER = 2**53
-"""Limit up to which all integers are exact as doubles, the usual type in MATLAB."""
+"""Limit up to which all integers are exact as doubles, the default numeric type of MATLAB."""
 _KEYWORDS = {
     "break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for",
     "function", "global", "if", "otherwise", "parfor", "persistent", "return", "spmd", "switch",
@@ -32,9 +31,9 @@ def _write(log: Log, path: Path, written: Written) -> None:
     """Exports a log as a MATLAB file: tables as structs, with description and scenario.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         path: The file.
-        written: Function that is called with the number of records written since its last call.
+        written: Function that is called with the number of records written since the last call.
 
     Raises:
         UsageError: The log is too large for a MATLAB file.
@@ -42,12 +41,12 @@ def _write(log: Log, path: Path, written: Written) -> None:
     variables: dict[str, Any] = {}
 
     def store(table: Table, table_name: str) -> None:
-        """Adds a table as a struct to the variables that the MATLAB file will contain.
+        """Adds a table as a struct to the variables of the MATLAB file.
 
         Args:
             table: Table of the log, such as the records of a site.
-            table_name: Name of the table: "m1" for the records of the site m1, and "m1.link"
-                for another table of this site, which becomes a field of its struct.
+            table_name: Name of the table: "m1" for the records of site m1, and "m1.link" for
+                another table of this site, which becomes a field of its struct.
         """
         struct = _build_struct(table)
         site, _, kind = table_name.partition(".")
@@ -74,14 +73,14 @@ def _write(log: Log, path: Path, written: Written) -> None:
 def _name_table(table: Table) -> str:
     """Returns the name under which a table is stored in the MATLAB file.
 
-    If the name is a keyword of MATLAB, such as "end", the suffix "_site" is appended.
+    If the name is a MATLAB keyword, such as "end", the suffix "_site" is appended.
     """
     name = f"{table.name}_site" if table.name in _KEYWORDS else table.name
     return name_inside(table, name, ".")
 
 
 def _build_struct(table: Table) -> dict[str, Any]:
-    """Returns the columns of a table as fields of a struct, and their units in `units`."""
+    """Returns the columns of a table as fields of a struct, with their units in `units`."""
     struct = {column.name: _convert_column(column, table) for column in table.columns}
     struct["units"] = {column.name: column.unit for column in table.columns}
     return struct
@@ -90,9 +89,9 @@ def _build_struct(table: Table) -> dict[str, Any]:
 def _convert_column(column: Column, table: Table) -> Any:
     """Converts the values of a column to a type that is convenient in MATLAB.
 
-    Texts become rows of characters, or cells in the table of events. Integers become doubles,
-    the type with which MATLAB computes, if all of them are exact as doubles. Time stamps in ns
-    stay integers, because most of them are too large for doubles.
+    Strings become char arrays, or cell arrays in the table of events. Integers become doubles,
+    the type in which MATLAB computes, if all of them are exact as doubles. Time stamps in ns
+    remain integers, because most of them are too large for that.
     """
     if column.is_text:
         is_event_table = not table.kind

@@ -1,7 +1,7 @@
-"""Exports a log as a NumPy file (.npz) with an array per column of its tables.
+"""Exports a log as a NumPy file (.npz) with one array per table column.
 
-The arrays have names such as "m1/q1_rad", "m1/link/age_s_us" and "events/text". The text
-"about_json" describes all columns, and the text "scenario_toml" is the scenario.
+Array names look like "m1/q1_rad", "m1/link/age_s_us" and "events/text". The entry "about_json"
+describes all columns, and the entry "scenario_toml" contains the scenario.
 """
 
 from pathlib import Path
@@ -18,18 +18,18 @@ def _write(log: Log, path: Path, written: Written) -> None:
     """Exports a log as a NumPy .npz file: columns as arrays, with description and scenario.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         path: The file.
-        written: Function that is called with the number of records written since its last call.
+        written: Function that is called with the number of records written since the last call.
     """
     arrays: dict[str, NDArray[Any]] = {}
 
     def store(table: Table, table_name: str) -> None:
-        """Adds each column of a table to the arrays that the NumPy file (NPZ) will contain.
+        """Adds each column of a table to the arrays of the NumPy file (NPZ).
 
         Args:
             table: Table of the log, such as the records of a site.
-            table_name: Name of the table, which is the first part of the names of its arrays.
+            table_name: Name of the table, used as the prefix of its array names.
         """
         for column in table.columns:
             values = column.texts() if column.is_text else column.numbers()

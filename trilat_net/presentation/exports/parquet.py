@@ -1,8 +1,8 @@
-"""Exports a log as a folder of Parquet files, with one file per table.
+"""Exports a log as a folder of Parquet files, one file per table.
 
-A table contains, for instance, the records of one arm, with a row per period of its control
-loop. Parquet is a compressed column format that pandas, polars and DuckDB read. Two more files
-in the folder describe the columns and contain the scenario.
+A table contains, for instance, the records of one arm, with one row per tick. Parquet is a
+compressed columnar format that pandas, polars and DuckDB can read. Two more files in the folder
+contain the descriptions of the columns and the scenario.
 """
 
 import io
@@ -16,9 +16,9 @@ def _write(log: Log, folder: Path, written: Written) -> None:
     """Exports a log as Parquet tables in a folder, with their description and the scenario.
 
     Args:
-        log: Log of the run that is exported.
-        folder: Existing folder of the files.
-        written: Function that is called with the number of records written since its last call.
+        log: Log of the run to export.
+        folder: Existing folder for the files.
+        written: Function that is called with the number of records written since the last call.
     """
     write_table_files(log, folder, written, ".parquet", _write_table)
 

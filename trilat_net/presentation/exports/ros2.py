@@ -1,15 +1,14 @@
-"""Exports a log as a ROS 2 bag: standard messages in an MCAP file of the profile `ros2`.
+"""Exports a log as a ROS 2 bag: standard messages in an MCAP file with the profile `ros2`.
 
-A bag can be played with `ros2 bag play`, or read by tools for ROS. Its messages are those that
-the live bridge to ROS 2 would have published during the run.
+The bag can be played with `ros2 bag play` or read by ROS tools. It contains the messages that
+the live ROS 2 bridge would have published during the run.
 
 Invariant:
-    - A bag has every record, the stored result of one tick (period) of an arm's control loop,
-      exactly once, with its values and times. No record is left out.
+    - The bag contains every record exactly once, with its values and times.
     - The names and types of the topics are those of the live bridge
       (`trilat_net.log.ros2.published`).
-    - The stamp of a header is the nominal time of its tick. The publish time of a message is
-      the time of sending, and its log time is the time of arrival.
+    - Header stamps are the nominal times of the ticks. The publish time of a message is when it
+      was sent, and its log time is when it arrived.
 """
 
 import heapq
@@ -40,16 +39,16 @@ SOURCE_METADATA = "trilat.source"
 """Name of the metadata record that describes the exported session."""
 _QOS_FILE = cdr.DEFINITIONS / "qos.yaml"
 _QOS = _QOS_FILE.read_text(encoding="utf-8")
-"""Template of a quality of service, as rosbag2 writes it: reliable."""
+"""Template of a reliable quality of service (QoS) profile in rosbag2 notation."""
 _VOLATILE = {"DEPTH": "10", "DURABILITY": "2"}
-"""Values for `_QOS`: the last ten messages, for present subscribers."""
+"""Values for `_QOS`: keep the last ten messages, for current subscribers only."""
 _LATCHED = {"DEPTH": "1", "DURABILITY": "1"}
-"""Values for `_QOS`: the last message, for late subscribers as well (transient local)."""
+"""Values for `_QOS`: keep the last message for late subscribers too (transient local)."""
 _RECORDS_PER_REPORT = 1000
-"""Number of records between two reports of progress."""
+"""Number of records between two progress reports."""
 
 TopicMessages = list[tuple[str, bytes]]
-"""Encoded messages, each with its topic."""
+"""Pairs of topic and encoded message."""
 TimedMessages = tuple[int, int, TopicMessages]
 """Log time in ns, publish time in ns, and the topic and data of each message with these times.
 """
@@ -62,24 +61,22 @@ def export_ros2(
     *,
     names: str = NAMINGS[0],
 ) -> None:
-    """Writes a log as a file that `ros2 bag` and other players of ROS 2 bags can read.
+    """Writes a log as a bag that `ros2 bag` and other ROS 2 players can read.
 
-    Topics of sites are `/<session>/<site>/joint_states` and others. Topics of the session are
-    `/<session>/events`, `/<session>/log`, `/tf` and `/diagnostics`. The metadata of the
-    channels contain units, names and representations of orientations. An existing file is
-    replaced.
+    Each site has topics such as `/<session>/<site>/joint_states`. The topics of the session are
+    `/<session>/events`, `/<session>/log`, `/tf` and `/diagnostics`. Channel metadata contain
+    the units, names and orientation representations. An existing file is replaced.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         path: File of the bag.
-        written: Function that is called with the number of records written since its last call.
-        names: Names of the topics: "crisp", "crtk", or a file of names as for
-            `trilat ros2 --names`.
+        written: Function that is called with the number of records written since the last call.
+        names: Topic naming: "crisp", "crtk", or a file of names as for `trilat ros2 --names`.
 
     Raises:
         LogError: A message of the log cannot be read.
         UsageError: The names cannot be read.
-        OSError: The disk refused the data.
+        OSError: The data could not be written to disk.
     """
     table = TopicTable.read(names)
     log_session = log.session.get("session", "") or log.scenario.name
@@ -127,7 +124,7 @@ def export_ros2(
 
 
 def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channel:
-    """Adds the quality of service to the metadata of a channel, as rosbag2 writes it."""
+    """Adds the quality of service (QoS) to the metadata of a channel, in rosbag2 notation."""
     text = _QOS
     values = _LATCHED if channel.latched else _VOLATILE
     for placeholder, value in values.items():
@@ -137,14 +134,14 @@ def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channe
 
 
 class _SiteBag:
-    """Converts the messages of one arm to standard ROS 2 messages in a bag, a file of messages.
+    """Converts the records of one arm to standard ROS 2 messages for a bag.
 
     Args:
-        log: Log of the run that is exported.
+        log: Log of the run to export.
         site: Name of the site.
         session: Name of the session in topics.
-        table: Names of the topics.
-        progress: Function that is called with the number of records since its last call.
+        table: Topic names.
+        progress: Function that is called with the number of records since the last call.
     """
 
     def __init__(
@@ -168,7 +165,7 @@ class _SiteBag:
         return self._table.find(self._session, self._site, topic)
 
     def _name_messages(self, messages: ros2_messages.NamedMessages) -> TopicMessages:
-        """Returns messages with the full names of their topics."""
+        """Returns the messages with fully qualified topic names."""
         topic_messages: TopicMessages = []
         for name, data in messages:
             topic = self._find_topic(name)
@@ -176,10 +173,10 @@ class _SiteBag:
         return topic_messages
 
     def iterate_records(self) -> Iterator[TimedMessages]:
-        """Yields the ROS messages about the motion of a site's arm, such as its joint states.
+        """Yields ROS messages about the motion of a site's arm, such as its joint states.
 
-        The messages are in the order in which the records arrived in the log, as a bag needs.
-        The first messages also contain the description of the robot.
+        The messages are sorted by the time at which the records arrived in the log, as required
+        for a bag. The first messages include the robot description.
         """
         records = self._log[self._site]
         dominance = DominanceHistory.of_log(self._log, self._site, records.t_s)
@@ -208,10 +205,10 @@ class _SiteBag:
                 self._progress(new_records)
 
     def iterate_statistics(self) -> Iterator[TimedMessages]:
-        """Yields the ROS messages about the delays and losses of the links to the site.
+        """Yields ROS messages about the delays and losses of the links to the site.
 
-        Each item contains the time of arrival in the log and the time of publication, both in
-        ns, and the messages. The items are sorted by the time of arrival, which a bag needs.
+        Each item contains the time of arrival in the log, the time of publication (both in ns),
+        and the messages. Items are sorted by time of arrival, as required for a bag.
         """
         timed = self._log.timed_link_stats(self._site)
         log_times_ns = timed.log_ns.tolist()
@@ -225,13 +222,13 @@ class _SiteBag:
 
 
 def _find_epoch_ns(log: Log) -> int:
-    """Returns the Unix time of a session's common start, in ns, or 0 in virtual time."""
+    """Returns the Unix time at which a session started, in ns, or 0 in virtual time."""
     epoch_text = log.session.get("epoch_unix_ns", "0")
     return int(epoch_text)
 
 
 def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields the messages about the events of a session."""
+    """Yields the messages for the events of a session."""
     timed = log.timed_events()
     log_times_ns = timed.log_ns.tolist()
     publish_times_ns = timed.publish_ns.tolist()
@@ -243,10 +240,10 @@ def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
 
 
 def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
-    """Yields a ROS message per second about the state of all sites, for monitoring tools.
+    """Yields one ROS message per second about the state of all sites, for monitoring tools.
 
-    Each message is composed from the newest record of every site. Its times are the latest
-    times of these records, and never earlier than those of the previous message, because a bag
+    Each message is composed from the most recent record of every site. Its times are the latest
+    times of these records, but never earlier than those of the previous message, because a bag
     must be sorted by time.
     """
     site_logs = [log[site] for site in log.sites if len(log[site])]

@@ -1,23 +1,24 @@
-"""Draws figures of network delays, and of the timing of control loops.
+"""Draws figures of network delays and of the timing of control loops.
 
-An arm publishes its state, a sample, in each period of its control loop (tick). These figures
-show whether the network and the computers were fast enough. They show three times:
+Each tick, an arm publishes a sample of its state. These figures show whether the network and
+the computers were fast enough, using three durations:
 
-- The delay of a sample is the time that it needs from sender to receiver.
-- The age of a sample is the time since it was sent. At a receiver it grows until a newer sample
-  arrives.
-- The lateness is the time by which a tick started after it was due.
+- The delay of a sample is the time it takes to travel from sender to receiver.
+- The age of a sample is the time since it was sent. At the receiver, the age grows until a
+  newer sample arrives.
+- The lateness of a tick is how long after its due time it started.
 
 Invariant:
     - If the delays of a link follow a measured series, the figure has no line for the delay
-      that the scenario states.
-    - A run whose links all have one constant delay has no figure of distributions, because
-      these would be vertical lines.
-    - A run in virtual time reads no clock. The figure of its loops gives this reason instead of
-      showing zeros.
+      specified in the scenario.
+    - A run whose links all have one constant delay has no figure of delay distributions, which
+      would be vertical lines.
+    - A run in virtual time does not read a clock. The figure of its loop timing states this
+      reason instead of showing zeros.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,31 +33,35 @@ from ..plot_signals import sample_ages_ms
 from .figure_entry import draws, unless
 
 _POINTS = 400
-"""Number of points of a distribution."""
+"""Number of points on a distribution curve."""
 _RARE_RATIO = 6.0
-"""An axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
+"""The axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
 _STEP_MS = 1.5
-"""If an age falls by more than this from one tick to the next, it counts as a fluctuation.
+"""A drop in age from one tick to the next counts as a fluctuation if it exceeds this value.
 
-If two samples arrive in the same tick of 1 ms, the age falls by about 1 ms, which is normal.
+A drop of about 1 ms is normal: it occurs whenever two samples arrive in the same tick of 1 ms.
 """
 NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
 NO_LOOP_TIMES = "no lateness and no computing time in this log"
+_SPREAD_BUCKETS = 120
+"""Number of time intervals for which `_plot_spread` draws a median and a band."""
+_SPREAD: style.LineOptions = {"color": style.FAINT, "alpha": 0.35, "linewidth": 6.0}
+"""Options of the legend line that represents the band of a spread."""
 _BINS_PER_DECADE = 20
-"""Number of bins of a histogram per decade, for example between 1 us and 10 us."""
+"""Number of histogram bins per decade, for example between 1 us and 10 us."""
 
 
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
 def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the age of the sample in use on every link over time, in ms.
 
-    The age of a sample of a peer's state is the time from its sending until its use. The figure
-    has a row per receiver. An age that fluctuates is drawn as a band with its median, because a
-    line would fill the area between its extremes.
+    The age is the time since the sample was sent. The figure has one row per receiver. An age
+    that fluctuates is drawn as a band with its median, because a line would fill the area
+    between its extremes.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     ages_ms = _read_ages_ms(log)
     timeline = Timeline(log)
@@ -70,9 +75,9 @@ def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             line_style = style.site_line(log, peer, 1.4)
             plot.mark(axes, [site], f"{peer}->{site}")
 
-            if is_unsteady(age_ms):
+            if _is_unsteady(age_ms):
                 has_bands = True
-                style.plot_spread(axes, log[site].t_s, age_ms, **line_style)
+                _plot_spread(axes, log[site].t_s, age_ms, **line_style)
             else:
                 plot.trace(axes, site, age_ms, **line_style)
 
@@ -88,13 +93,13 @@ def _draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         if np.any(np.isfinite(stated_ms)):
             entries.append(("mean delay as stated", style.LIMIT_LINE))
         if has_bands:
-            entries.append(("least to largest, with median", style.SPREAD))
+            entries.append(("least to largest, with median", _SPREAD))
         plot.finish(grid[-1], entries, links=True)
     return plot.figure
 
 
 def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
-    """Returns the age of the sample in use, shape (K,), in ms, by sender and receiver."""
+    """Returns the ages of the samples in use, in ms, shape (K,), by (sender, receiver)."""
     ages_ms = {}
     for site in log.sites:
         columns = sample_ages_ms(log, site).T
@@ -106,12 +111,12 @@ def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
 def _add_link_panels(
     figure: Figure, log: Log
 ) -> tuple[style.AxesGrid, dict[tuple[str, str], Axes]]:
-    """Adds a grid of panels to a figure: a row per receiving site, with a panel per sender.
+    """Adds a grid of panels to a figure: one row per receiving site, one panel per sender.
 
     All panels share their axes, so that the delays of links can be compared.
 
     Returns:
-        The grid of panels, and the panels by sender and receiver.
+        The grid of panels, and a mapping from (sender, receiver) to panel.
     """
     site_count = len(log.sites)
     sender_count = site_count - 1  # a site does not send to itself
@@ -125,18 +130,71 @@ def _add_link_panels(
 
 
 def has_varying_delay(log: Log) -> bool:
-    """Returns True if the delays of a run vary and their distribution is therefore of interest.
+    """Returns True if the delays of a run vary, so that their distribution is worth showing.
 
-    If the delays do not vary, figures and pages leave the distribution out.
+    Figures and pages omit the distribution if the delays do not vary.
 
     Args:
         log: Log of the run.
 
     Returns:
-        True if at least one link has more than one constant delay.
+        True if at least one link does not have a single constant delay.
     """
     links = Timeline(log).stated_links.values()
     return not all(link.has_one_constant_delay for link in links)
+
+
+class DelayAxis(NamedTuple):
+    """Delay axis shared by the distributions of all links of a run.
+
+    Attributes:
+        x_ms: Delays at which the curves are evaluated, in ms, shape (P,). They extend to the
+            longest delay or age, and are equally spaced on a linear or a logarithmic axis.
+        is_logarithmic: True if only a few values are large, in which case a linear axis would
+            hide the others.
+    """
+
+    x_ms: Array
+    is_logarithmic: bool
+
+    @classmethod
+    def of_links(cls, links: Sequence[DelayDistribution]) -> "DelayAxis":
+        """Chooses an axis that covers the delays and ages of links.
+
+        Args:
+            links: Delays and ages of all links that share the axis.
+        """
+        value_arrays: list[Array] = [np.zeros(0)]
+        for link in links:
+            value_arrays += [link.delay_ms, link.age_ms]
+        values_ms = np.concatenate(value_arrays)
+        known_ms = values_ms[np.isfinite(values_ms)]
+
+        longest_ms = float(known_ms.max(initial=0.0))
+        end_ms = 1.05 * max(longest_ms, 1.0)
+        if not needs_log_axis(known_ms):
+            return cls(np.linspace(0.0, end_ms, _POINTS), False)
+
+        # A logarithmic axis has no 0. It begins below nearly all values.
+        short_ms = float(np.percentile(known_ms, 1.0))
+        start_ms = max(0.5 * short_ms, 0.1)
+        return cls(np.geomspace(start_ms, end_ms, _POINTS), True)
+
+    def compute_percent(self, values_ms: Array) -> Array:
+        """Returns the percentage of values that do not exceed each delay on the axis.
+
+        This is the cumulative distribution of the values, such as ages.
+
+        Args:
+            values_ms: The values to count, in ms, shape (K,).
+
+        Returns:
+            Percentages, shape (P,). All are NaN if there are no values.
+        """
+        if not len(values_ms):
+            return np.full(len(self.x_ms), np.nan)
+        counts = np.searchsorted(np.sort(values_ms), self.x_ms, side="right")
+        return 100.0 * counts / len(values_ms)
 
 
 @draws(
@@ -148,33 +206,32 @@ def has_varying_delay(log: Log) -> bool:
 def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the distributions of the delay and of the age of samples on every link.
 
-    The delay of a sample is the time until its arrival, its age the time until its use. A curve
-    at x shows the percentage of samples with a delay of at most x ms, or of ticks with an age
-    of at most x ms. The figure has a row per receiver.
+    The delay of a sample is the time from sending to arrival, and its age the time from sending
+    to use. A curve at x shows the percentage of samples with a delay of at most x ms, or of
+    ticks with an age of at most x ms. The figure has one row per receiver.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     links = DelayDistribution.list_of_log(log)
-    x_ms = choose_delay_axis_ms(links)
+    axis = DelayAxis.of_links(links)
     with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
         grid, panels = _add_link_panels(figure, log)
         for link in links:
             axes = panels[link.peer, link.site]
-            age_percent = compute_cumulative_percent(link.age_ms, x_ms)
-            delay_percent = compute_cumulative_percent(link.delay_ms, x_ms)
-            axes.plot(x_ms, age_percent, **style.site_line(log, link.peer, 1.8))
-            axes.plot(x_ms, delay_percent, **style.LIMIT_LINE)
+            age_percent = axis.compute_percent(link.age_ms)
+            delay_percent = axis.compute_percent(link.delay_ms)
+            axes.plot(axis.x_ms, age_percent, **style.site_line(log, link.peer, 1.8))
+            axes.plot(axis.x_ms, delay_percent, **style.LIMIT_LINE)
         for axes in grid[:, 0]:
             axes.set_ylabel("cumulative (%)")
         for axes in grid[-1]:
             axes.set_xlabel("delay or age (ms)")
 
         first_panel = grid[0, 0]
-        first_panel.set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
-        is_logarithmic = x_ms[0] > 0.0
-        if is_logarithmic:
+        first_panel.set(ylim=(0.0, 104.0), xlim=(axis.x_ms[0], axis.x_ms[-1]))
+        if axis.is_logarithmic:
             first_panel.set_xscale("log")
             labelled_digits = (1.0,) if form.narrow else (1.0, 2.0, 5.0)
             style.set_plain_log_axis(first_panel.xaxis, labelled_digits)
@@ -184,66 +241,19 @@ def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
     return figure
 
 
-def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
-    """Chooses the delays at which the curves of the distributions have points.
-
-    The delays reach up to the longest delay or age. Their steps are equal, or equal on a
-    logarithmic axis if only few values are long.
-
-    Args:
-        links: Delays and ages of all links that share the axis.
-
-    Returns:
-        The delays, in ms, shape (P,). The first one is 0 unless the axis is logarithmic.
-    """
-    value_arrays: list[Array] = [np.zeros(0)]
-    for link in links:
-        value_arrays += [link.delay_ms, link.age_ms]
-    values_ms = np.concatenate(value_arrays)
-    known_ms = values_ms[np.isfinite(values_ms)]
-
-    longest_ms = float(known_ms.max(initial=0.0))
-    end_ms = 1.05 * max(longest_ms, 1.0)
-    if not needs_log_axis(known_ms):
-        return np.linspace(0.0, end_ms, _POINTS)
-
-    # A logarithmic axis has no 0. It begins below nearly all values.
-    short_ms = float(np.percentile(known_ms, 1.0))
-    start_ms = max(0.5 * short_ms, 0.1)
-    return np.geomspace(start_ms, end_ms, _POINTS)
-
-
-def compute_cumulative_percent(values: Array, limits: Array) -> Array:
-    """Returns the percentage of values that do not exceed each limit.
-
-    The points are the cumulative distribution of the values, for example of ages.
-
-    Args:
-        values: The values to count, shape (K,).
-        limits: The limits, shape (P,).
-
-    Returns:
-        Percentages, shape (P,). All are NaN if there are no values.
-    """
-    if not len(values):
-        return np.full(len(limits), np.nan)
-    counts = np.searchsorted(np.sort(values), limits, side="right")
-    return 100.0 * counts / len(values)
-
-
 def trace_stated_delay(timeline: Timeline, link: str) -> tuple[Array, Array]:
-    """Returns the mean delay that the scenario states for a network link, as a line to draw.
+    """Returns the mean delay that the scenario specifies for a link, as a line to plot.
 
-    Figures draw this line dashed beside the measured delays, which should agree with it.
+    Figures draw this line dashed next to the measured delays, which should agree with it.
 
     Args:
-        timeline: What happened in the run. It has the delay models of the link. A model applies
+        timeline: Timeline of the run, with the delay models of the link. Each model applies
             until the next one replaces it.
         link: Name of the link, "j->i".
 
     Returns:
-        Times in s, and mean delays in ms, each of shape (3 M,) for M models. Each model has a
-        point at its start, a point at its end, and a NaN that interrupts the line.
+        Times in s and mean delays in ms, each of shape (3 M,) for M models. Each model
+        contributes a point at its start, a point at its end, and a NaN that breaks the line.
     """
     models = timeline.stated_links[link].models
     starts_s = [model.from_s for model in models]
@@ -260,12 +270,12 @@ def trace_stated_delay(timeline: Timeline, link: str) -> tuple[Array, Array]:
 
 
 def needs_log_axis(ages_ms: Array) -> bool:
-    """Returns True if a few ages are so long that a linear axis would hide the others.
+    """Returns True if a few large ages would hide the others on a linear axis.
 
-    This happens after an outage of a link, for example.
+    This happens after a link outage, for example.
 
     Args:
-        ages_ms: Ages, shape (K,). NaN values are ignored.
+        ages_ms: Ages in ms, shape (K,). NaN values are ignored.
     """
     known_ms = ages_ms[np.isfinite(ages_ms)]
     if not len(known_ms):
@@ -274,21 +284,61 @@ def needs_log_axis(ages_ms: Array) -> bool:
     return bool(known_ms.max() > _RARE_RATIO * usual_ms)
 
 
-def is_unsteady(ages_ms: Array) -> bool:
+def _is_unsteady(ages_ms: Array) -> bool:
     """Returns True if ages fluctuate so often that a line would look like a filled area.
 
-    The figure then draws the spread of the ages as a band.
+    In that case, the figure shows the spread of the ages as a band.
 
     Args:
-        ages_ms: Ages of the message in use over time, shape (K,), in ms.
+        ages_ms: Age of the sample in use over time, in ms, shape (K,).
     """
     # The age falls whenever a newer message comes into use.
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
-    return len(falls) > style.SPREAD_BUCKETS
+    return len(falls) > _SPREAD_BUCKETS
+
+
+def _plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
+    """Plots a fluctuating signal as its median within a band from minimum to maximum.
+
+    The time axis is divided into `_SPREAD_BUCKETS` intervals with equal numbers of values. Each
+    interval contributes one point of the median and of the band edges.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        t_s: Times of the values, in s, shape (K,).
+        values: The values, shape (K,). NaN values are ignored.
+        **options: Options of the median line. They must include a "color", which also applies
+            to the band.
+    """
+    buckets = np.array_split(np.arange(len(values)), _SPREAD_BUCKETS)
+    points = []
+    for bucket in buckets:
+        if len(bucket):
+            middle_s = t_s[bucket].mean()
+            points.append((middle_s, *_compute_spread(values[bucket])))
+
+    middles_s, smallest, median, largest = np.array(points).reshape(-1, 4).T
+    axes.fill_between(
+        middles_s,
+        smallest,
+        largest,
+        color=options["color"],
+        alpha=_SPREAD["alpha"],
+        linewidth=0.0,
+    )
+    axes.plot(middles_s, median, **options)
+
+
+def _compute_spread(values: Array) -> tuple[float, float, float]:
+    """Returns the minimum, median and maximum of the finite values. NaN if there are none."""
+    # NumPy prints a warning if all values are NaN.
+    if not np.isfinite(values).any():
+        return np.nan, np.nan, np.nan
+    return np.nanmin(values), np.nanmedian(values), np.nanmax(values)
 
 
 def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
-    """Scales the value axis of ages to all values, shape (K,). NaN values are ignored."""
+    """Scales the age axis to fit all values, shape (K,). NaN values are ignored."""
     known = values_ms[np.isfinite(values_ms)]
     if needs_log_axis(known):
         least_ms = float(known[known > 0.0].min())
@@ -299,7 +349,7 @@ def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
 
 
 def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the legend entries of the senders of samples."""
+    """Returns the legend entries for the senders of samples."""
     return [
         (f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8))
         for site in log.sites
@@ -307,15 +357,15 @@ def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
 
 
 def explain_missing_loop_times(log: Log) -> str:
-    """Returns the reason why a log has no figures about the timing of the control loops.
+    """Returns the reason why a log has no figures of control loop timing.
 
-    Only runs in real time measure how late a tick (control period) began, and how long it took.
+    Only runs in real time measure how late a tick started and how long it took.
 
     Args:
         log: Log of the run.
 
     Returns:
-        The reason. Empty if at least one site has such times.
+        The reason. Empty if at least one site has timing data.
     """
     for site in log.sites:
         records = log[site]
@@ -325,43 +375,45 @@ def explain_missing_loop_times(log: Log) -> str:
     return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
 
 
-def choose_bin_edges_us(log: Log) -> Array:
-    """Chooses the bins for histograms of the lateness and computing time of control loops.
+class LoopTimeBins(NamedTuple):
+    """Histogram bins for the lateness and the computing time of control loops.
 
-    The bins have equal widths on a logarithmic axis, from 1 us to just above the longest time
-    in the log.
+    The bins have equal widths on a logarithmic axis.
 
-    Args:
-        log: Log of the run.
-
-    Returns:
-        Edges of the bins in us, shape (B + 1,).
+    Attributes:
+        edges_us: Bin edges in us, shape (B + 1,).
     """
-    largest_us = 0
-    for site in log.sites:
-        for times_us in (log[site].late_us, log[site].busy_us):
-            largest_us = max(largest_us, int(times_us.max(initial=0)))
 
-    decades = np.log10(max(largest_us, 10) * 1.1)
-    bin_count = int(np.ceil(decades * _BINS_PER_DECADE))
-    exponents = np.arange(bin_count + 1) / _BINS_PER_DECADE
-    return np.power(10.0, exponents)
+    edges_us: Array
 
+    @classmethod
+    def of_log(cls, log: Log) -> "LoopTimeBins":
+        """Chooses bins from 1 us to just above the longest time in a log.
 
-def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
-    """Counts how many times lie in each bin of a histogram of control loop timing.
+        Args:
+            log: Log of the run.
+        """
+        largest_us = 0
+        for site in log.sites:
+            for times_us in (log[site].late_us, log[site].busy_us):
+                largest_us = max(largest_us, int(times_us.max(initial=0)))
 
-    Times below 1 us are counted in the first bin.
+        decades = np.log10(max(largest_us, 10) * 1.1)
+        bin_count = int(np.ceil(decades * _BINS_PER_DECADE))
+        exponents = np.arange(bin_count + 1) / _BINS_PER_DECADE
+        return cls(np.power(10.0, exponents))
 
-    Args:
-        times_us: Times in us, shape (K,).
-        edges_us: Edges of the bins in us, shape (B + 1,).
+    def count_times(self, times_us: Ints) -> Ints:
+        """Counts the times in each bin. Times below 1 us are counted in the first bin.
 
-    Returns:
-        Number of times in each bin, shape (B,).
-    """
-    counts, _ = np.histogram(np.maximum(times_us, 1), edges_us)
-    return counts.astype(np.int64)
+        Args:
+            times_us: Times in us, shape (K,).
+
+        Returns:
+            Number of times in each bin, shape (B,).
+        """
+        counts, _ = np.histogram(np.maximum(times_us, 1), self.edges_us)
+        return counts.astype(np.int64)
 
 
 @draws(
@@ -371,15 +423,15 @@ def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     in_report=True,
 )
 def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws histograms of how late the control loops began their periods, in us.
+    """Draws histograms of how late the control loops started their ticks, in us.
 
-    Further histograms show how long the computation of a period (tick) took.
+    Further histograms show how long the computation of a tick took.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
-    edges_us = choose_bin_edges_us(log)
+    bins = LoopTimeBins.of_log(log)
     labels = ("wake-up after the deadline", "computing time of a tick")
     if form.narrow:
         labels = ("lateness", "computing time")
@@ -392,7 +444,7 @@ def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             period_us = 1e6 / log.scenario.sites[site].rate_hz
 
             for axes, times_us in ((late_axes, records.late_us), (busy_axes, records.busy_us)):
-                _draw_histogram(axes, times_us, edges_us, colour)
+                _draw_histogram(axes, times_us, bins, colour)
                 axes.axvline(period_us, **style.LIMIT_LINE)
                 _title_histogram(axes, site, times_us, form)
             late_axes.set_ylabel("ticks (count)")
@@ -405,15 +457,15 @@ def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return figure
 
 
-def _draw_histogram(axes: Axes, times_us: Ints, edges_us: Array, colour: str) -> None:
+def _draw_histogram(axes: Axes, times_us: Ints, bins: LoopTimeBins, colour: str) -> None:
     """Draws the histogram of times on logarithmic axes."""
     axes.set(xscale="log", yscale="log")
-    counts = bin_loop_times(times_us, edges_us)
-    axes.stairs(counts, edges_us, baseline=0.5, fill=True, color=colour)
+    counts = bins.count_times(times_us)
+    axes.stairs(counts, bins.edges_us, baseline=0.5, fill=True, color=colour)
 
 
 def _title_histogram(axes: Axes, site: str, times_us: Ints, form: FigureSize) -> None:
-    """Writes the site and the percentiles of its times, shape (K,), above a histogram."""
+    """Adds a title with the site and percentiles of its times, shape (K,), to a histogram."""
     if not len(times_us):
         style.annotate_empty_panel(axes, f"no times of {site}")
         return

@@ -1,14 +1,14 @@
-"""Draws the poses of the arms at a few times of a run, for a figure and for a page.
+"""Draws the poses of the arms at a few moments of a run, for a figure and for a page.
 
-A planar arm is drawn in its plane. An arm in space, called a chain, is drawn as seen from one
-fixed direction, in parallel projection. Up in the picture is opposite to gravity.
+A planar arm is drawn in its plane. An arm in space, called a chain, is drawn in parallel
+projection from a fixed direction, with gravity pointing down.
 
-The figure "arms" is one of Matplotlib, and `render_arms_svg` returns SVG for the page. Both
-draw the same poses, which `find_pose` computes.
+The figure "arms" is drawn with Matplotlib, and `render_arms_svg` returns SVG for the page. Both
+draw the same poses, which are computed by `find_pose`.
 
 Invariant:
-    - The positions of the joints are those of the simulation kernel's forward kinematics.
-    - The reference pose of each arm, which its control law tries to reach, is drawn with dashed
+    - Joint positions come from the simulation kernel's forward kinematics.
+    - The reference pose that the control law of each arm tries to reach is drawn with dashed
       lines.
 """
 
@@ -20,10 +20,9 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import Timeline, joint_positions_m, site_signals, upright_axes
+from ...analysis import Timeline, build_arm_rows, site_signals
 from ...core import Array
 from ...log import Log
-from ...scenario import ArmModel
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..html_templates import render_macro
@@ -31,16 +30,16 @@ from ..plot_signals import reference_angles
 from .figure_entry import draws
 
 INSTANTS = 6
-"""Number of times at which the arms are drawn."""
+"""Number of moments at which the arms are drawn."""
 _NARROW_INSTANTS = 3
-"""Number of times in a figure that is as wide as one column of a paper."""
+"""Number of moments in a figure that is as wide as one column of a paper."""
 _PATH_POINTS = 400
-"""Largest number of points of the path of an end effector."""
+"""Maximum number of points on the path of an end effector."""
 _AZIMUTH = np.deg2rad(-50.0)
-"""Direction of view of chains: angle about the vertical, from the x axis of the base, in rad.
+"""Viewing direction for chains: angle about the vertical, from the x axis of the base, in rad.
 """
 _ELEVATION = np.deg2rad(22.0)
-"""Direction of view of chains: angle above the floor, in rad."""
+"""Viewing direction for chains: angle above the floor, in rad."""
 _SHADOW: dict[str, Any] = {
     "color": "#c9c9c9",
     "linewidth": 1.6,
@@ -55,12 +54,12 @@ _DESIRED: dict[str, Any] = {
 PictureBox = tuple[float, float, float, float]
 """Left, right, bottom and top of a picture."""
 _CORNERS_ON_PATH = np.array([0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4])
-"""Numbers of a box's corners along a path that visits all of its edges.
+"""Corner numbers of a box along a path that visits all of its edges.
 
-The bits of a number state on which side of the box the corner lies, along x, y and z.
+The bits of a number state on which side of the box the corner lies along x, y and z.
 """
 _BOX_PATH = 0.5 - (_CORNERS_ON_PATH[:, np.newaxis] >> np.arange(3) & 1)
-"""The path as points of a box with sides of length 1 around the origin, shape (16, 3)."""
+"""The path along the edges of a unit cube centred at the origin, shape (16, 3)."""
 _BASE: dict[str, Any] = {
     "linestyle": "none",
     "marker": "s",
@@ -70,15 +69,15 @@ _BASE: dict[str, Any] = {
 
 
 class _ArmPose(NamedTuple):
-    """Pose of an arm at one time, as points in the plane of a picture.
+    """Pose of an arm at one moment, as points in the picture plane.
 
     Attributes:
-        actual: Base, joints and end effector, shape (L, 2), in m.
-        desired: The same points for the reference pose, shape (L, 2), in m.
-        path: Path of the end effector from the start of the run, shape (P, 2), in m.
-        shadow: Shadow of a chain on a floor at its base, with light from straight above, shape
-            (L, 2), in m. Planar arms have no shadow: shape (0, 2).
-        bodies: For each body that the arm can touch, its edges as a path, shape (16, 2), in m.
+        actual: Base, joints and end effector, in m, shape (L, 2).
+        desired: The same points for the reference pose, in m, shape (L, 2).
+        path: Path of the end effector from the start of the run, in m, shape (P, 2).
+        shadow: Shadow of a chain on a floor at its base, with light from straight above, in m,
+            shape (L, 2). Planar arms have no shadow: shape (0, 2).
+        bodies: For each body that the arm can touch, its edges as a path, in m, shape (16, 2).
     """
 
     actual: Array
@@ -88,12 +87,12 @@ class _ArmPose(NamedTuple):
     bodies: Sequence[Array] = ()
 
     def scale(self, factor: float) -> "_ArmPose":
-        """Returns the pose with all points multiplied by a factor, for another unit.
+        """Returns the pose with all points multiplied by a factor.
 
-        This converts a pose in m to the units of a picture.
+        This converts a pose from m to picture units.
 
         Args:
-            factor: The factor.
+            factor: Picture units per m.
         """
         return _ArmPose(
             actual=factor * self.actual,
@@ -104,31 +103,31 @@ class _ArmPose(NamedTuple):
         )
 
     def list_points(self) -> Array:
-        """Returns all points that are drawn for this pose, from which the picture is scaled.
+        """Returns all points drawn for this pose, from which the picture limits are computed.
 
         Returns:
-            The points of the arms, of their paths and of the touched bodies, shape (K, 2), in
-            m.
+            The points of the arms, of their paths and of the touched bodies, in m, shape (K,
+            2).
         """
         parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
         return np.concatenate(parts)
 
 
 def trace_bodies_m(
-    arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array
+    upright_axes: Array | None, sizes_m: Iterable[Sequence[float]], poses: Array
 ) -> list[Array]:
-    """Returns the edges of box-shaped bodies as paths in the plane of a picture.
+    """Returns the edges of box-shaped bodies as paths in the picture plane.
 
-    A path visits all edges of a box, so that one line draws the box.
+    A path visits all edges of a box, so that the box can be drawn as a single line.
 
     Args:
-        arm: Arm of the site, which determines the projection.
+        upright_axes: See `project_arm_m`.
         sizes_m: Size of each of the b bodies along its own axes, in m.
         poses: Poses of the bodies in K records, shape (K, 7 b): for each body the position in
-            m, and the unit quaternion of its orientation with w first.
+            m, followed by the orientation as a unit quaternion with w first.
 
     Returns:
-        A path per body, shape (K, 16, 2), in m.
+        One path per body, in m, shape (K, 16, 2).
     """
     paths = []
     body_count = poses.shape[1] // 7
@@ -143,32 +142,35 @@ def trace_bodies_m(
         inner = np.cross(quaternion_v, corners) + quaternion_w * corners
         rotated = corners + 2.0 * np.cross(quaternion_v, inner)
         edges = rotated + position
-        if arm.chain is None:
+        if upright_axes is None:
             paths.append(edges[..., :2])  # a planar arm is drawn in its x-y plane
         else:
-            paths.append(project_arm_m(arm, edges))
+            paths.append(project_arm_m(upright_axes, edges))
     return paths
 
 
-def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
-    """Projects points of an arm to the plane of a picture, in m.
+def project_arm_m(
+    upright_axes: Array | None, points: Array, *, onto_floor: bool = False
+) -> Array:
+    """Projects points of an arm onto the picture plane, in m.
 
-    A planar arm lies in the plane already. An arm in space is seen from one fixed direction,
-    with "up" opposite to gravity.
+    A planar arm already lies in this plane. An arm in space is viewed from a fixed direction,
+    with gravity pointing down.
 
     Args:
-        arm: Model of the arm.
-        points: Points in the frame of the base, in m, shape (..., 3). Points of a planar arm
-            have the shape (..., 2), and are returned unchanged.
+        upright_axes: Forward, sideways and up axes of an upright frame, expressed in the base
+            frame, shape (3, 3). `None` for a planar arm.
+        points: Points in the base frame, in m, shape (..., 3). Points of a planar arm have
+            shape (..., 2) and are returned unchanged.
         onto_floor: True to return the shadows of the points on a floor at the base.
 
     Returns:
-        Points in the picture, shape (..., 2), in m.
+        Points in the picture, in m, shape (..., 2).
     """
-    if arm.chain is None:
+    if upright_axes is None:
         return points
 
-    upright_points = points @ upright_axes(arm.chain).T
+    upright_points = points @ upright_axes.T
     x, y, z = np.moveaxis(upright_points, -1, 0)
     # Rotate about the vertical axis by the azimuth, then tilt by the elevation of the viewer.
     across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
@@ -178,18 +180,18 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     return np.stack([across, up], axis=-1)
 
 
-def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
+def _choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     """Chooses the times at which to draw the arms, including the first and the last time.
 
-    Equal steps of time would mostly show arms at rest. Therefore the times are equally spaced
-    in a measure of progress to which time and motion contribute one half each.
+    Equally spaced times would mostly show arms at rest. The times are instead equally spaced in
+    a measure of progress that gives equal weight to elapsed time and to motion.
 
     Args:
         log: Log of the run.
-        count: Largest number of times. There may be fewer, because the times are rounded.
+        count: Maximum number of times. Fewer are returned if times coincide after rounding.
 
     Returns:
-        The times in increasing order, in s.
+        The times in ascending order, in s.
     """
     end_s = Timeline(log).end_s
     grid_s = np.linspace(0.0, end_s, 1001)
@@ -223,7 +225,7 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
     """Returns the pose of an arm at a given time, with the path of its end effector (tip).
 
-    The pose is that of the newest record at or before the time.
+    The pose is taken from the most recent record at or before that time.
 
     Args:
         log: Log of the run.
@@ -234,7 +236,8 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
         The points to draw, in m. `None` if the site has no record up to this time.
     """
     records = log[site]
-    arm = log.scenario.arms[site]
+    arm = build_arm_rows(log.scenario, site)
+    axes = arm.upright_axes
     until_s = t_s + 1e-9  # tolerates rounding errors of the time
     last = int(np.searchsorted(records.t_s, until_s, side="right")) - 1
     if last < 0:
@@ -242,20 +245,20 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
 
     # Points of the path of the end effector. The last of them belongs to the last record.
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
-    positions = joint_positions_m(arm, records.q[rows])
-    actual = project_arm_m(arm, positions)
+    positions = arm.joint_positions_m(records.q[rows])
+    actual = project_arm_m(axes, positions)
 
     reference = reference_angles(records)[last : last + 1]
-    desired = project_arm_m(arm, joint_positions_m(arm, reference)[0])
+    desired = project_arm_m(axes, arm.joint_positions_m(reference)[0])
 
     shadow: Array = np.zeros((0, 2))
-    if arm.chain is not None:
-        shadow = project_arm_m(arm, positions[-1:], onto_floor=True)[0]
+    if axes is not None:
+        shadow = project_arm_m(axes, positions[-1:], onto_floor=True)[0]
 
     bodies: list[Array] = []
     sizes_m = log.scenario.bodies_m(site).values()
     if sizes_m:
-        paths = trace_bodies_m(arm, sizes_m, records.bodies[last : last + 1])
+        paths = trace_bodies_m(axes, sizes_m, records.bodies[last : last + 1])
         bodies = [path[0] for path in paths]
     return _ArmPose(
         actual=actual[-1], desired=desired, path=actual[:, -1], shadow=shadow, bodies=bodies
@@ -263,11 +266,10 @@ def find_pose(log: Log, site: str, t_s: float) -> _ArmPose | None:
 
 
 def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
-    """Returns a box around poses of arms and their base: the limits of the axes of a picture.
+    """Returns a box around arm poses and their base, for use as the axis limits of a picture.
 
-    The box has a margin. Before the margin is added, the box is made at least 70 % as wide as
-    it is high, and at least 70 % as high as it is wide, so that pictures are never narrow
-    strips.
+    Neither side of the box is shorter than 70 % of the other, so pictures are never narrow
+    strips. A margin is added last.
 
     Args:
         poses: The poses. Entries that are `None` are ignored.
@@ -293,16 +295,16 @@ def compute_pose_box_m(poses: Sequence[_ArmPose | None]) -> PictureBox:
 
 @draws("arms", "the arms at a few instants", in_report=True)
 def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the poses of all arms at a few times, with a row per site and a column per time.
+    """Draws the poses of all arms at a few moments, one row per site and one column per moment.
 
-    A reader sees at one glance how the arms moved, and how closely they followed each other.
+    The figure shows at a glance how the arms moved, and how closely they followed each other.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     instants = _NARROW_INSTANTS if form.narrow else INSTANTS
-    times_s = choose_instants_s(log, instants)
+    times_s = _choose_instants_s(log, instants)
     poses = {}
     for site in log.sites:
         poses[site] = [find_pose(log, site, t_s) for t_s in times_s]
@@ -341,7 +343,7 @@ def _draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
-    """Draws a pose into a panel, or a note if `pose` is `None` for lack of a record."""
+    """Draws a pose in a panel, or a note if `pose` is `None` because there is no record."""
     axes.set_aspect("equal")
     if pose is None:
         style.annotate_empty_panel(axes, "no record")
@@ -368,14 +370,14 @@ def _draw_pose(axes: Axes, pose: _ArmPose | None, colour: str) -> None:
 
 
 def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
-    """Draws the poses of all arms at a few times, as SVG pictures for the report's web page.
+    """Draws the poses of all arms at a few moments as SVG pictures for the report's web page.
 
-    There is a row per arm and a column per time. Arms without records are left out.
+    There is one row per arm and one column per moment. Arms without records are omitted.
 
     Args:
         log: Log of the run.
         bounds_m: Left, right, bottom and top of every picture, in m.
-        factor: Scale of the pictures, in units of the picture per m.
+        factor: Scale of the pictures, in picture units per m.
 
     Returns:
         HTML with the pictures.
@@ -383,7 +385,7 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
     left_m, right_m, bottom_m, top_m = bounds_m
     bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
 
-    times_s = choose_instants_s(log)
+    times_s = _choose_instants_s(log)
     rows = []
     for index, site in enumerate(log.sites):
         if not len(log[site]):
@@ -408,13 +410,13 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
 def _measure_picture(
     pose: _ArmPose | None, index: int, bounds: PictureBox, label: str
 ) -> dict[str, Any]:
-    """Returns the coordinates that the SVG template of a pose needs: lines, joints, view box.
+    """Returns the coordinates needed by the SVG template of a pose: lines, joints, view box.
 
-    The page of the report contains such a picture for each arm, at a few times.
+    The report page contains such a picture for each arm at a few moments.
 
     Args:
-        pose: The pose in units of the picture. `None` for a picture without an arm.
-        index: Index of the site, on which its colour depends.
+        pose: The pose in picture units. `None` for a picture without an arm.
+        index: Index of the site, which determines its colour.
         bounds: Left, right, bottom and top of the picture.
         label: Description of the picture for screen readers.
     """
@@ -448,5 +450,5 @@ def _measure_picture(
 
 
 def _format_points(points: Array) -> str:
-    """Returns points, shape (K, 2), as text for SVG, whose y axis points downwards."""
+    """Formats points, shape (K, 2), for SVG, whose y axis points downwards."""
     return " ".join(f"{x:.3f},{-y:.3f}" for x, y in points)

@@ -2,16 +2,16 @@
 
 There are two figures:
 
-- `draw_functional` draws V, the energy function with which the stability of the coupled arms is
-  proved, and which must not rise by itself (docs/theory/certificate-energy.md). It also draws
-  the parts of V, the contribution of each arm, the energy that was dissipated, the work that
-  was done on the arms, and the residual: the change of V that dissipation and work do not
-  explain.
-- `draw_observed_energy` is for control laws that prove their passivity by energy accounts: they
-  record how much energy they have received and supplied. The figure draws these energies.
+- `draw_functional` draws V, the energy function used to prove the stability of the coupled
+  arms, which must not rise on its own (docs/theory/certificate-energy.md). It also draws the
+  components of V, the contribution of each arm, the dissipated energy, the work done on the
+  arms, and the residual, which is the change of V not explained by dissipation and work.
+- `draw_observed_energy` is for control laws that prove their passivity through energy
+  accounting, by recording how much energy they have received and supplied. The figure draws
+  these energies.
 
 Invariant:
-    - Times for which V is unknown, because records are missing, are shaded.
+    - Times at which V is unknown because of missing records are shaded.
     - The largest rise of V is marked, because V must not rise in a stable run.
 """
 
@@ -22,12 +22,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import Certificate, EnergyBalance, ObservedEnergy, certify_log
+from ...analysis import Certificate, EnergyBalance, ObservedEnergy
 from ...core import Array
 from ...log import Log
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
-from ..premise_text import explain_no_functional
+from ..verdict_text import explain_no_functional
 from .figure_entry import draws, unless
 
 _PART_LABELS = {
@@ -63,9 +63,9 @@ _OBSERVED_PANELS = {
     "store": "stored (J)",
     "given": "given, taken (J)",
 }
-"""Label of the panel of each kind of declared energy.
+"""Panel label for each kind of declared energy.
 
-The panel "given" also shows the kind "taken", the energy that a law dissipated.
+The panel "given" also shows the kind "taken", the energy dissipated by a law.
 """
 
 
@@ -74,15 +74,15 @@ def draw_functional(
 ) -> Figure:
     """Draws the energy function V of the stability proof and its balance, in J over time.
 
-    V decreases if the controllers dissipate more energy than the operators supply. The panels
-    are, from the top: V and the contribution of each site; the parts of V; dissipation and
-    work; and the residual of the balance, the part of V that these energies do not explain.
-    Without a balance the figure shows the reason.
+    V decreases if the controllers dissipate more energy than the operators supply. From top to
+    bottom, the panels show V and the contribution of each site; the components of V;
+    dissipation and work; and the residual of the balance, which these energies do not explain.
+    If there is no balance, the figure shows the reason.
 
     Args:
         log: Log of the run.
-        certificate: Judgement whether the run was stable, which contains the balance.
-        form: Width, type sizes and resolution of the figure.
+        certificate: Stability certificate of the run, which contains the balance.
+        form: Width, font sizes and resolution of the figure.
     """
     balance = certificate.balance
     if balance is None:
@@ -121,29 +121,29 @@ def draw_functional(
     in_report=True,
 )
 def _draw_certificate(log: Log, form: FigureSize) -> Figure:
-    """Draws the energy function V of the stability proof over the time of a run.
+    """Draws the energy function V of the stability proof over the time of a run, in J.
 
-    V must never rise without supplied energy. This function is called through the registry of
-    figures.
+    V must never rise unless energy is supplied. This function is called through the figure
+    registry.
     """
     own_laws = log.may_run_user_laws
-    return draw_functional(log, certify_log(log, own_laws=own_laws), form)
+    return draw_functional(log, Certificate.of_log(log, own_laws=own_laws), form)
 
 
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energies for which the control laws keep accounts, in J over time.
+    """Draws the energies that the control laws account for, in J over time.
 
     Some control laws ensure stability by never returning more energy than they received, and
-    record this account. The figure has a panel for each kind of energy: in transit between
-    sites, known to the receivers, stored, and exchanged with the arms. A curve of energy in
-    transit has the colour of the receiving site.
+    record this account. There is one panel per kind of energy: in transit between sites, known
+    to the receivers, stored, and exchanged with the arms. Curves of energy in transit use the
+    colour of the receiving site.
 
     Args:
         log: Log of the run.
         observed: The declared energies, at least one.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     kinds = {curve.kind for curve in observed.curves}
     panel_kinds = [kind for kind in _OBSERVED_PANELS if kind in kinds]
@@ -184,14 +184,14 @@ def _has_declared_energies(log: Log) -> bool:
     in_report=True,
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
-    """Draws the declared energies of a log's control laws, for the registry of figures."""
+    """Draws the energies declared by a log's control laws, for the figure registry."""
     observed = ObservedEnergy.of_log(log, own_laws=log.may_run_user_laws)
     assert observed is not None
     return draw_observed_energy(log, observed, form)
 
 
 def _draw_line(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
-    """Draws values at the ticks of a balance, shape (T,)."""
+    """Plots values at the ticks of a balance, shape (T,)."""
     ticks = np.arange(len(balance.t_s))
     style.plot_decimated(axes, ticks, balance.t_s, values, **options)
 
@@ -208,7 +208,7 @@ def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
 
 
 def _choose_legend_pt(form: FigureSize) -> float:
-    """Returns the type size of a legend inside a panel, in pt."""
+    """Returns the font size for a legend inside a panel, in pt."""
     is_uniform = form.small_pt == form.tick_pt
     return form.small_pt if is_uniform else form.small_pt + 0.5
 
@@ -216,8 +216,8 @@ def _choose_legend_pt(form: FigureSize) -> float:
 def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyBalance) -> None:
     """Draws the energy V of the stability proof, and the contribution of each arm.
 
-    If the weights of the arms that the paper states do not apply, V with these weights is drawn
-    as a dashed line for comparison.
+    If the arm weights given in the paper do not apply, V with these weights is drawn as a
+    dashed line for comparison.
     """
     _draw_line(balance, axes, balance.V, **_TOTAL)
     paper_balance = certificate.paper_balance
@@ -230,11 +230,10 @@ def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyB
 
 
 def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the parts of the energy function V over time, in J.
+    """Draws the components of the energy function V over time, in J.
 
-    V is the energy function of the stability proof. Its parts are the kinetic energy, the
-    energies of the errors of parameters and positions, and the energy of messages that are in
-    transit.
+    These are the kinetic energy, the energies of the parameter and position errors, and the
+    energy of samples in transit.
     """
     for (name, values), dashes in zip(balance.parts.items(), style.DASHES, strict=True):
         _draw_line(
@@ -250,10 +249,9 @@ def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 
 
 def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the energy that was dissipated in a run, and the work that supplied it, in J.
+    """Draws the energy dissipated in a run, and the work that supplied energy, in J.
 
-    The work of all links between sites is drawn as one line. Sources with negligible work are
-    left out.
+    The work of all links is drawn as a single line. Sources with negligible work are omitted.
     """
     dissipations = balance.dissipation.items()
     for (name, values), line_pattern in zip(dissipations, style.DASHES, strict=False):
@@ -282,16 +280,16 @@ def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
     """Draws the residual of the energy balance, which shows whether the log fits the model.
 
-    The solid line is the residual: the change of the energy function V that neither dissipation
-    ("taken") nor the work on the arms ("given") explains. Part of the residual arises because
-    the control law is executed in ticks ("sampling"). The dotted line is the residual without
-    this part. The value axis is logarithmic, so that the residual can be compared with the
-    largest energy.
+    The solid line is the residual: the change of the energy function V that is explained
+    neither by dissipation ("taken") nor by work on the arms ("given"). Part of the residual is
+    caused by executing the control law in ticks ("sampling"). The dotted line is the residual
+    without this part. The value axis is logarithmic, so that the residual can be compared with
+    the largest energy.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         balance: V and all energies that change it, in J over time.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     largest_energy = balance.scale or 1.0
     floor = 1e-9 * largest_energy  # smaller magnitudes are drawn at this height

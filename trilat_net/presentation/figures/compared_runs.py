@@ -1,7 +1,7 @@
-"""Draws a signal of several runs over one another, with a panel per arm and joint.
+"""Draws a signal of several runs in the same axes, with one panel per arm and joint.
 
-For example, one can compare the angle of a joint for three delays. The colour of a line is that
-of its arm, and the dashes distinguish the runs: the first run is solid. The legend names the
+This can compare, for example, the angle of a joint for three delays. Lines have the colour of
+their arm, and the dash pattern identifies the run: the first run is solid. The legend lists the
 settings in which the runs differ.
 
 Invariant:
@@ -18,28 +18,28 @@ from ...analysis import Timeline, site_signals
 from ...core import Array
 from ...errors import UsageError, count_nouns
 from ...log import Log, SiteLog
-from ...scenario import compare_scenarios
+from ...scenario import ScenarioDifference
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .joint_motion import add_joint_rows, choose_height_in
 
 _MOST_SETTINGS = 3
-"""Largest number of differing settings that the legend names for each run."""
+"""Maximum number of differing settings listed in the legend for each run."""
 _FIRST_ALPHA = 0.45
 """Opacity of the lines of the first run."""
 _LETTERS_PER_IN = 15.0
-"""Average number of letters of the legend per inch."""
+"""Average number of legend letters per inch."""
 
 
 class _ComparedSignal(NamedTuple):
-    """A quantity of the arms, such as the error, that a figure compares between runs.
+    """A quantity of the arms, such as the error, that a figure compares across runs.
 
     Attributes:
         name: Name for the labels of the value axes.
         find_unit: Function that returns the unit of the signal in a log.
         compute: Function that returns the signal of a site, shape (K, n).
         shares_poses: True if the columns are the coordinates that the sites exchange. In task
-            space these are axes of the end effectors instead of joints.
+            space, these are the axes of the end effectors instead of joints.
     """
 
     name: str
@@ -57,24 +57,23 @@ COMPARED_SIGNALS = {
         "torque", lambda _: "N m", site_signals.controller_torques
     ),
 }
-"""Signals that `draw_compared_runs` draws, by the names of the figures of one run."""
+"""Signals that `draw_compared_runs` can draw, keyed by the figure name for a single run."""
 
 
 def draw_compared_runs(
     logs: Mapping[str, Log], name: str, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws a signal, such as the joint angles, of several runs over one another.
+    """Draws a signal of several runs, such as the joint angles, in the same axes.
 
-    There is a panel per arm and joint. The dashes of a line distinguish the runs.
+    There is one panel per arm and joint. The dash pattern of a line identifies the run.
 
     Args:
-        logs: Logs of the runs, by their names in the legend.
+        logs: Mapping from the legend name of each run to its log.
         name: Name of the signal, one of `COMPARED_SIGNALS`.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
 
     Raises:
-        UsageError: There are too many runs for the patterns of dashes, or the runs have no site
-            in common.
+        UsageError: There are more runs than dash patterns, or the runs have no site in common.
     """
     if len(logs) > len(style.DASHES):
         raise UsageError(
@@ -129,12 +128,12 @@ def draw_compared_runs(
 
 
 def _style_run(number: int, form: FigureSize) -> style.LineOptions:
-    """Returns the options of the lines of a run: dashes, width and opacity, without the colour.
+    """Returns the line options for a run: dash pattern, width and opacity, but no colour.
 
-    The first run is solid, wide and pale, so that dashed lines on top of it stay visible.
+    The first run is solid, wide and pale, so that dashed lines on top of it remain visible.
 
     Args:
-        number: Number of the run, from 0.
+        number: Index of the run, starting from 0.
         form: Size of the figure.
     """
     width_pt = 0.8 if form.narrow else 1.0
@@ -148,26 +147,28 @@ def _style_run(number: int, form: FigureSize) -> style.LineOptions:
 
 
 def list_common_sites(logs: Mapping[str, Log]) -> list[str]:
-    """Lists the arms that all compared runs have, in the order of the first run.
+    """Lists the sites that are present in all compared runs, in the order of the first run.
 
     Args:
-        logs: The logs, by their names.
+        logs: Mapping from the name of each run to its log.
     """
     first_log, *others = logs.values()
     return [site for site in first_log.sites if all(site in log.sites for log in others)]
 
 
 def label_runs(logs: Mapping[str, Log], form: FigureSize) -> dict[str, str]:
-    """Returns the text of each run in a legend: its name, and the settings in which it differs.
+    """Returns the legend label of each run: its name, and the settings in which it differs.
 
-    An example is "slow: control.Kd = 3, every link 800 ms". Long texts are broken into lines.
+    An example is "slow: control.Kd = 3, every link 800 ms". Long labels are broken into lines.
 
     Args:
-        logs: Logs of the runs, by their names.
+        logs: Mapping from the name of each run to its log.
         form: Size of the figure, whose width limits the length of a line.
     """
     scenarios = [log.scenario for log in logs.values()]
-    differences = compare_scenarios(scenarios) if len(scenarios) > 1 else []
+    differences = []
+    if len(scenarios) > 1:
+        differences = ScenarioDifference.list_between(scenarios)
     first_scenario = scenarios[0]
     letters_per_line = round(_LETTERS_PER_IN * form.width_in)
     labels = {}

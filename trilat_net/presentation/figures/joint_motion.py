@@ -1,19 +1,19 @@
 """Draws the signals of the arms, such as torques, angles, errors and contact forces.
 
-Each function with the decorator `draws` is one figure. Most signals are read from the log of
-the run. Some are computed:
+Each function decorated with `draws` is one figure. Most signals are read from the log of the
+run. Some are computed:
 
-- Weights with which an arm follows the other arms (dominance factors) are computed from the
-  scenario, the description of the experiment, and its recorded changes.
+- Dominance factors are computed from the scenario and its recorded changes.
 - Contact forces are computed from the walls of the scenario and the recorded motion, by
   `analysis.torque_sources`.
 - The settling time, after which an error stays small, is computed by `analysis.site_signals`.
 
 Invariant:
-    - Torques of operators (the people or programs that move arms) are drawn as they act on the
-      arm. The log contains the opposite sign, the torque that the arm exerts on the operator.
+    - Operator torques are drawn as they act on the arm. The log contains the opposite sign, the
+      torque exerted by the arm on the operator.
 """
 
+import textwrap
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -33,29 +33,28 @@ from ...analysis import (
 from ...core import LINK_PARAMETERS, Array
 from ...execution import SimulatedLog
 from ...log import Log
-from ...own_code import find_user_laws
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
 
 _ROW_IN = 1.2
-"""Height of every further row of panels, in inches."""
+"""Height of each additional row of panels, in inches."""
 _TRANSPOSED = {"col": "row", "none": "none"}
-"""Setting for shared value axes after rows and columns have been exchanged."""
+"""Setting for shared value axes after swapping rows and columns."""
 _LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
-"""Smallest lower end of the axis of errors, in rad."""
+"""Minimum for the lower end of the error axis, in rad."""
 _PLANES = ((0, 1), (0, 2), (1, 2))
 """Horizontal and vertical axis of each plane in which paths are drawn."""
 _LOOP_PT = 0.8
-"""Width of a line that crosses itself, in pt."""
+"""Width of a line that may cross itself, in pt."""
 _PATH_STEP = 0.01
 """Distance between two points of a thinned path, relative to the extent of the path."""
 _LINK_PANEL_PT = 5.5
-"""Type size of titles and time labels in the figure of link parameters, in pt."""
+"""Font size of titles and time labels in the figure of link parameters, in pt."""
 NO_OPERATOR = "no site has an operator in this run"
 
 explain_absent_operator = unless(plot_signals.sites_with_operator, NO_OPERATOR)
-"""Returns the reason why a log has no torque of an operator. Empty if it has such a torque."""
+"""Returns the reason why a log has no operator torque. Empty if it has one."""
 
 
 @draws(
@@ -65,13 +64,11 @@ explain_absent_operator = unless(plot_signals.sites_with_operator, NO_OPERATOR)
     in_report=True,
 )
 def _draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the torques of the operators on the arms over time, as Fig. 3 of the paper.
-
-    An operator is the person or program that moves an arm. The torques are in N m.
+    """Draws the operator torques on the arms over time, in N m, as in Fig. 3 of the paper.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     return _draw_joints(
         log=log,
@@ -85,16 +82,15 @@ def _draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def _explain_absent_displacement(log: Log) -> str:
     """Returns the reason why a run cannot be repeated without its operators.
 
-    The displacement of an arm by its operators is the difference between a run and its
-    repetition without operators.
+    The repetition is needed to compute how far the operators displaced the arms.
 
     Returns:
-        The reason: there are no operators, or the code of a user's control law may not run
-        here. Empty if the run can be repeated.
+        The reason: there are no operators, or the code of a user's control law is not allowed
+            to run here. Empty if the run can be repeated.
     """
     if not any(site.hands for site in log.scenario.sites.values()):
         return NO_OPERATOR
-    for law in find_user_laws(log.scenario):
+    for law in log.scenario.inspect_user_laws():
         if not law.allowed:
             return str(law)
     return ""
@@ -109,14 +105,14 @@ def _explain_absent_displacement(log: Log) -> str:
 def draw_operator_displacement(
     log: Log, form: FigureSize = REPORT_SIZE, *, twin: Log | None = None
 ) -> Figure:
-    """Draws how far the operators, people or programs that move the arms, displaced every arm.
+    """Draws how far the operators displaced every arm, in rad over time.
 
-    The displacement, in rad, is the difference between the recorded run and a simulation of the
-    same run without operators.
+    The displacement is the difference between the recorded run and a simulation of the same run
+    without operators.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
         twin: The run without operators. `None` to simulate it.
     """
     run_without_operators = SimulatedLog.without_operators(log) if twin is None else twin
@@ -133,12 +129,12 @@ def draw_operator_displacement(
 def _draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques that the controllers command at the joints of all arms, in N m.
 
-    These torques do not include the torques of operators and walls. If a controller reached its
-    torque limit, the limit is drawn too.
+    Operator and wall torques are not included. If a controller reached its torque limit, the
+    limit is drawn too.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     reached_limits = list[Array]()
     for site in log.sites:
@@ -166,23 +162,23 @@ def _draw_joints(
     label: str,
     limits: Sequence[Array] = (),
 ) -> Figure:
-    """Draws a signal over time, with a panel per joint and a line per site.
+    """Draws a signal over time, with one panel per joint and one line per site.
 
-    The functions that draw angles, torques and errors use it, so that these figures look alike.
+    Figures of angles, torques and errors share this function, so that they look alike.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
         sites: Names of the sites that have the signal.
         signal: Function that returns the signal of a site.
         label: Label of the value axis.
-        limits: Limits of the signal, shape (n,) each. They are drawn with both signs.
+        limits: Limits of the signal, shape (n,) each, drawn with both signs.
     """
     joint_count = len(style.name_joints(log))
     row_count = len(style.arrange_joints(joint_count, form.narrow))
     with style.time_figure(log, form, 2.2 + _ROW_IN * (row_count - 1)) as plot:
-        panels = style.add_joint_panels(plot.figure, joint_count, form)
-        style.title_joints(log, panels.joints)
+        panels = plot.add_joint_panels(joint_count)
+        _title_joints(log, panels.joints)
         plot.joint_row(panels.joints, sites, signal)
         for joint, axes in enumerate(panels.joints):
             # Equal limits of several sites are drawn once. Arms may have fewer joints.
@@ -213,27 +209,28 @@ def add_joint_rows(
     sharey: str,
     titles: Sequence[str] = (),
 ) -> tuple[list[list[Axes]], list[Axes]]:
-    """Adds a grid of panels to a figure: one panel per quantity and joint.
+    """Adds a grid of panels to a figure, with one panel per quantity and joint.
 
-    Arms with two joints have a column per joint and a row per quantity. Arms with more joints
-    have a row per joint and a column per quantity, because a row of many joints would not fit.
+    Arms with two joints have one column per joint and one row per quantity. Arms with more
+    joints have one row per joint and one column per quantity, because a row with many joints
+    would not fit.
 
     Args:
         figure: The figure.
         log: Log with the joints.
-        form: Width, type sizes and resolution of the figure.
-        heads: Title of each quantity, used above a column.
-        labels: Label of each quantity, used beside a row.
+        form: Width, font sizes and resolution of the figure.
+        heads: Titles of the quantities, used above columns.
+        labels: Labels of the quantities, used beside rows.
         sharey: "col" if the quantities of a joint share their value axis, otherwise "none".
-        titles: Titles of the joints. Empty for their names.
+        titles: Titles of the joints. Empty to use the joint names.
 
     Returns:
-        The panels, by quantity and then by joint, and the lowest panel of each column.
+        The panels, indexed by quantity and then by joint, and the bottom panel of each column.
     """
     titles = titles or style.name_joints(log)
     if len(titles) == 2:
         grid = style.add_panels(figure, len(labels), 2, sharex=True, sharey=sharey)
-        style.title_joints(log, grid[0], titles)
+        _title_joints(log, grid[0], titles)
         for row, label in zip(grid, labels, strict=True):
             row[0].set_ylabel(label)
         return [list(row) for row in grid], list(grid[-1])
@@ -242,7 +239,7 @@ def add_joint_rows(
         figure, len(titles), len(heads), sharex=True, sharey=_TRANSPOSED[sharey]
     )
     for row, title in zip(grid, titles, strict=True):
-        style.label_row(row[0], title, form)
+        _label_row(row[0], title, form)
     for axes, head in zip(grid[0], heads, strict=True):
         axes.set_title(head)
     # The caller gets the panels by quantity and joint, in either arrangement.
@@ -251,14 +248,13 @@ def add_joint_rows(
 
 @draws("operation", "torque on the arms above their angles", explain_absent_operator)
 def _draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the torques of the operators on the arms, in N m, and the joint angles, in rad.
+    """Draws the operator torques on the arms, in N m, and the joint angles, in rad.
 
-    An operator is the person or program that moves an arm. The torques are above the angles, or
-    beside them if the arms have more than two joints.
+    The torques are above the angles, or beside them if the arms have more than two joints.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     heads = ("torque on the arm (N m)", "joint angle (rad)")
     if form.narrow:
@@ -284,11 +280,11 @@ def _draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def choose_height_in(log: Log, two_joints_in: float) -> float:
     """Returns the height of a figure with panels per joint, in inches.
 
-    If arms have more than two joints, each joint has a row of panels, see `add_joint_rows`.
+    Arms with more than two joints have one row of panels per joint, see `add_joint_rows`.
 
     Args:
         log: Log of the run.
-        two_joints_in: Height of the figure of arms with two joints, in inches.
+        two_joints_in: Height of the figure for arms with two joints, in inches.
     """
     joint_count = len(style.name_joints(log))
     if joint_count == 2:
@@ -300,14 +296,14 @@ def choose_height_in(log: Log, two_joints_in: float) -> float:
 
 @draws("positions", "actual and desired angles (Fig. 4 of the paper)", in_report=True)
 def _draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the desired and the actual joint angles over time, as Fig. 4 of the paper.
+    """Draws the desired and the actual joint angles over time, as in Fig. 4 of the paper.
 
-    A site is an arm with its controller. Its desired angles are the average of the angles of
-    the other sites, weighted with the dominance factors. The angles are in rad.
+    The desired angles of a site are the mean of the other sites' angles, weighted by the
+    dominance factors. All angles are in rad.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     heads = [f"{site}: q (rad)" for site in log.sites]
     labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
@@ -344,24 +340,24 @@ def _draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     in_report=True,
 )
 def _draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the tracking errors of every site over time, as Fig. 5 of the paper.
+    """Draws the tracking errors of every site over time, as in Fig. 5 of the paper.
 
     The error is e = q - q_des, the actual minus the desired joint angles. The panel below
-    shows, at each time, the largest error of any joint from then on. The settling time is
-    reached when this line falls below the dashed limit.
+    shows, for each time, the largest error of any joint from then on. The settling time is when
+    this line falls below the dashed limit.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
     unit = plot_signals.shared_unit(log)
     row_count = len(style.arrange_joints(len(titles), form.narrow))
     with style.time_figure(log, form, 3.6 + _ROW_IN * (row_count - 1)) as plot:
-        panels = style.add_joint_panels(plot.figure, len(titles), form, below="all")
+        panels = plot.add_joint_panels(len(titles), below="all")
         settling_panel = panels.below
         assert settling_panel is not None
-        style.title_joints(log, panels.joints, titles)
+        _title_joints(log, panels.joints, titles)
         error_signal = style.site_records(log, site_signals.joint_errors)
         plot.joint_row(panels.joints, log.sites, error_signal)
         first_in_rows = panels.joints[:: panels.columns]
@@ -393,11 +389,11 @@ def _draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 def _draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the largest error of any joint of every site over time, on a logarithmic axis.
 
-    A triangle marks the time at which a site settles, and the legend states this time.
+    A triangle marks the settling time of each site, which is also given in the legend.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     unit = plot_signals.shared_unit(log)
     entries = []
@@ -446,7 +442,7 @@ def _draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _has_changing_estimates(log: Log) -> bool:
-    """Returns True if an estimate of at least one site changes during the run."""
+    """Returns True if the estimates of at least one site change during the run."""
     for site in log.sites:
         records = log[site]
         if len(records) and np.ptp(records.theta_hat, axis=0).any():
@@ -464,12 +460,12 @@ def _draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
     """Draws the estimates of the arms' inertial parameters over time, with the true values.
 
     Adaptive control laws estimate these parameters while the arm moves. The figure shows the
-    estimates of all sites, whereas Fig. 6 of the paper shows only those of master 1. An arm in
-    space (a chain) has a row of panels per link, or two rows per link in a narrow figure.
+    estimates of all sites, whereas Fig. 6 of the paper shows only those of master 1. Arms in
+    space (chains) have one row of panels per link, or two rows per link in a narrow figure.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     arm = log.scenario.arms[log.sites[0]]
     if arm.chain is not None:
@@ -492,13 +488,13 @@ def _draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figur
 def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
     """Draws the estimates of the inertial parameters of arms in space, over time.
 
-    A link has `LINK_PARAMETERS` parameters, such as its mass, and each has a panel. The panels
+    A link has `LINK_PARAMETERS` parameters, such as its mass, with one panel each. The panels
     of a link fill one row, or two rows of a narrow figure. A panel shows the estimates of all
     sites whose arms have that link.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     arms = log.scenario.arms
     longest_arm = max((arms[site] for site in log.sites), key=lambda arm: arm.counts.joints)
@@ -517,7 +513,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
             plot.mark(axes, log.sites, numbered=False)
 
             # The panels are small. Therefore titles, ticks and labels are small too.
-            title = f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})"
+            title = f"{_typeset_symbol(symbol)} ({style.typeset_unit(unit)})"
             axes.set_title(title, fontsize=_LINK_PANEL_PT, pad=3.5)
             axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
             axes.locator_params(axis="y", nbins=2)
@@ -526,7 +522,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
             is_first_panel_of_link = index % LINK_PARAMETERS == 0
             if is_first_panel_of_link:
                 link_number = 1 + index // LINK_PARAMETERS
-                style.label_row(axes, f"{link_number}: {link}", form)
+                _label_row(axes, f"{link_number}: {link}", form)
 
         bottom_panels = grid[-1]
         plot.finish(list(bottom_panels), _list_estimate_entries(log))
@@ -536,7 +532,7 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
 
 
 def _list_estimate_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the legend entries of the figures of estimates."""
+    """Returns the legend entries for figures of estimates."""
     entries = style.site_legend_entries(log, log.sites)
     return [*entries, ("true value", style.LIMIT_LINE)]
 
@@ -550,8 +546,8 @@ def _draw_estimate(
 ) -> None:
     """Draws the estimates of one parameter and its true value.
 
-    The true value is drawn once if it is equal for all sites, otherwise in the colour of each
-    site.
+    The true value is drawn only once if it is the same for all sites, otherwise in the colour
+    of each site.
 
     Args:
         plot: The figure.
@@ -580,13 +576,14 @@ def _draw_estimate(
 def _draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the tracking errors of each joint against their rates of change (phase portrait).
 
-    Each joint has a panel. The horizontal axis shows the error q - q_des, the actual minus the
-    desired joint angle. The vertical axis shows the velocity error qd - qd_des. A stable motion
-    spirals to the origin. A ring marks the start of a site's motion, and a disc its end.
+    There is one panel per joint. The horizontal axis shows the error q - q_des, the actual
+    minus the desired joint angle, and the vertical axis the velocity error qd - qd_des. A
+    stable motion spirals towards the origin. A ring marks the start of a site's motion, and a
+    disc its end.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     titles = style.name_shared(log)
     unit = plot_signals.shared_unit(log)
@@ -611,7 +608,7 @@ def _draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                 path = np.stack([errors[:, joint], rates[:, joint]], axis=1)
                 _draw_path(axes, path, line_style)
 
-        style.title_joints(log, panels, titles)
+        _title_joints(log, panels, titles)
         for axes in panels:
             axes.set_xlabel(f"error ({unit})")
             if form.narrow:
@@ -635,15 +632,15 @@ def _has_only_chains(log: Log) -> bool:
     in_report=True,
 )
 def _draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the paths of the end effectors of arms in space, projected onto three planes, in m.
+    """Draws the end effector paths of arms in space, projected onto three planes, in m.
 
-    All sites share the coordinate frame. If the sites exchange poses of their end effectors
-    (task space), each path is scaled to the common task. A ring marks the start of a path, and
-    a disc its end.
+    All sites share one coordinate frame. If the sites exchange end effector poses (task space),
+    each path is scaled to the common task. A ring marks the start of a path, and a disc its
+    end.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     mosaic = style.arrange_joints(len(_PLANES), form.narrow)
     row_in = 0.9 * form.width_in / len(mosaic[0])
@@ -670,9 +667,10 @@ def _draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
 
 def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
-    """Draws the path of a point in a plane, with a ring at its start and a disc at its end.
+    """Draws a path in a plane, with a ring at its start and a disc at its end.
 
-    A pair of coordinates, such as an error and its rate, becomes a curve without a time axis.
+    The path can also be a pair of signals plotted against each other, such as an error and its
+    rate.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -688,16 +686,16 @@ def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
 
 
 def thin_path(path: Array) -> Array:
-    """Returns points of a path at about equal distances along it, including both ends.
+    """Returns points at approximately equal distances along a path, including both ends.
 
-    Figures need far fewer points than a log has records. The path is thinned by its length and
-    not by time, so that its fast parts keep as many points as its slow ones.
+    Figures need far fewer points than a log has records. Thinning by path length rather than by
+    time keeps as many points in the fast parts of the path as in the slow ones.
 
     Args:
         path: Points of the path, shape (K, 2), K > 0. Each axis is scaled to its own extent.
 
     Returns:
-        Some of the points, shape (P, 2).
+        A subset of the points, shape (P, 2).
     """
     extent = np.ptp(path, axis=0)
     scaled_path = path / np.where(extent > 0.0, extent, 1.0)
@@ -712,10 +710,8 @@ def thin_path(path: Array) -> Array:
     return thinned
 
 
-def list_sites_with_changing_dominance(log: Log) -> list[str]:
-    """Lists the arms whose dominance factors change during the run, in scenario order.
-
-    A dominance factor is the weight with which an arm follows another arm.
+def _list_sites_with_changing_dominance(log: Log) -> list[str]:
+    """Lists the sites whose dominance factors change during the run, in scenario order.
 
     Args:
         log: Log of the run.
@@ -727,21 +723,20 @@ def list_sites_with_changing_dominance(log: Log) -> list[str]:
 @draws(
     "authority",
     "shares that change, and the motion of the arms",
-    unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
+    unless(_list_sites_with_changing_dominance, "the shares of all sites are constant"),
 )
 def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws how the authority over the arms changes during a run, and how the arms move.
 
-    The upper panels show the dominance factors: the weights with which a site follows each of
-    the other sites. The lower panels show the displacements of the joints from the start, in
-    rad. A reader sees whether the arms move smoothly while the authority passes from one
-    operator to another.
+    The upper panels show the dominance factors, and the lower panels the joint displacements
+    from the start, in rad. The figure shows whether the arms move smoothly while authority
+    passes from one operator to another.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
-    changing_sites = list_sites_with_changing_dominance(log)
+    changing_sites = _list_sites_with_changing_dominance(log)
     titles = style.name_joints(log)
     row_count = len(changing_sites) + len(titles)
     has_low_rows = len(titles) > 2
@@ -765,7 +760,7 @@ def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
         for title, axes in zip(titles, joint_panels, strict=True):
             if has_low_rows:
-                style.label_row(axes, title, form)
+                _label_row(axes, title, form)
             else:
                 axes.set_ylabel(f"{title} (rad)")
             plot.mark(axes, log.sites)
@@ -774,7 +769,7 @@ def _draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _list_sites_with_walls(log: Log) -> list[str]:
-    """Lists the arms that can touch a wall, in the order of the scenario.
+    """Lists the sites whose arms can touch a wall, in scenario order.
 
     Args:
         log: Log of the run.
@@ -790,12 +785,12 @@ def _list_sites_with_walls(log: Log) -> list[str]:
 def _draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the force and the depth of the contact between the arms and the virtual walls.
 
-    The panels show the normal force of every wall, in N, and the depth to which the end
-    effector has entered the wall, in mm.
+    The panels show the normal force of every wall, in N, and how deep the end effector has
+    penetrated the wall, in mm.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     sites = _list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:
@@ -819,3 +814,47 @@ def _draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             plot.mark(axes, sites)
         plot.finish([depth_panel], style.site_legend_entries(log, sites))
     return plot.figure
+
+
+def _title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
+    """Adds a joint name, or another title, above each panel of a row.
+
+    Args:
+        log: Log with the joints.
+        row: One panel per title.
+        titles: The titles. Empty to use the joint names.
+    """
+    for title, axes in zip(titles or style.name_joints(log), row, strict=True):
+        axes.set_title(title)
+
+
+def _label_row(axes: Axes, text: str, form: FigureSize) -> None:
+    """Adds a label with several lines beside a row of low panels.
+
+    A long label on a single line would not fit beside a low panel.
+
+    Args:
+        axes: First panel of the row, beside which the label is written.
+        text: The label. It is wrapped after 12 characters.
+        form: Size of the figure, which determines the font size.
+    """
+    lines = textwrap.wrap(text, 12)
+    axes.set_ylabel("\n".join(lines), fontsize=form.tick_pt)
+
+
+def _typeset_symbol(parameter: str) -> str:
+    """Returns the Matplotlib symbol of an inertial parameter, with its index as a subscript.
+
+    Adaptive control laws estimate such parameters, for example a mass or an inertia.
+
+    Args:
+        parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
+            as "mc_x", or the mass.
+    """
+    if parameter[0] == "I":
+        stem = parameter[:1]
+        index = parameter[1:]
+    else:
+        stem = parameter[:2]
+        index = parameter[3:]  # behind the underscore
+    return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"

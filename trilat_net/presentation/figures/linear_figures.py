@@ -1,19 +1,18 @@
-"""Draws the results of linear analyses and of network measurements, which need no recorded run.
+"""Draws the results of linear analyses and network measurements, which need no recorded run.
 
-A linear model describes small motions of the coupled arms around a pose of rest.
+A linear model describes small motions of the coupled arms around a rest pose.
 
-- `draw_port_impedance` draws the impedance that operators feel at the joints that they move,
-  and `draw_port_passivity` shows whether the arms could supply energy to operators.
-- `draw_root_map` draws the characteristic roots of the linear model, in continuous time and as
-  executed in ticks (periods of the control loop). A root with a positive real part means that
-  the arms are unstable.
+- `draw_port_impedance` draws the impedance that operators feel at the joints they move, and
+  `draw_port_passivity` shows whether the arms could supply energy to the operators.
+- `draw_root_map` draws the characteristic roots of the linear model, both in continuous time
+  and as executed in ticks. A root with a positive real part means that the arms are unstable.
 - `draw_network_delays` draws the measured one-way delays of a network.
-- `draw_arm_gains` draws the largest stable stiffness of an arm for different delays.
+- `draw_arm_gains` draws the largest stable stiffness of an arm as a function of the delay.
 
 Invariant:
-    - Each line of an impedance has the colour of the arm that the operator holds. It is solid
-      if the other arm can move freely, and dashed if the other arm is clamped.
-    - Frequencies at which a criterion of passivity or stability fails are shaded.
+    - Each impedance curve has the colour of the arm held by the operator. It is solid if the
+      other arm can move freely, and dashed if the other arm is clamped.
+    - Frequencies at which a passivity or stability criterion fails are shaded.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,22 +39,24 @@ _PROOF: dict[str, Any] = {
     "linestyle": (0, (5, 1.5, 1, 1.5)),
 }
 _MAX_SHOWN_PARAMETER = 2.5
-"""Upper end of the axis of Llewellyn's parameter. Differences between values far above 1 do not
-matter.
+"""Upper end of the axis of Llewellyn's parameter. Differences between values far above 1 are
+irrelevant.
 """
 _CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
-"""Axis ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
+"""Axis ticks of a narrow panel, without labels at the ends, which would overlap those of the
+next panel.
+"""
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the impedance that operators feel along every joint over frequency.
+    """Draws the impedance that operators feel at every joint, over frequency.
 
-    The impedance is the ratio of force to velocity. For each joint, a panel of the magnitude is
-    above a panel of the phase. The panels of many joints are arranged in several rows.
+    The impedance is the ratio of force to velocity. Each joint has a magnitude panel above a
+    phase panel. If there are many joints, the panels wrap into several rows.
 
     Args:
-        ports: Analysis of the ports, the places at which operators hold the arms.
-        size: Width, type sizes and resolution of the figure.
+        ports: Analysis of the ports at which operators hold the arms.
+        size: Width, font sizes and resolution of the figure.
     """
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
@@ -97,10 +98,10 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the texts and line styles for the legend of a figure of impedances.
+    """Returns the labels and line styles for the legend of an impedance figure.
 
-    The impedance that an operator feels at one arm depends on another arm, which is free to
-    move or clamped.
+    The impedance that an operator feels at one arm depends on whether another arm is free or
+    clamped.
     """
     operator_sites = dict.fromkeys(response.operator_site for response in ports.transparency)
     entries: list[tuple[str, dict[str, Any]]] = [
@@ -116,13 +117,13 @@ def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, An
 
 
 def _plot_impedance(ports: PortAnalysis, joint: int, magnitude: Axes, phase: Axes) -> None:
-    """Draws the impedance that each operator feels along one joint, over frequency.
+    """Plots the impedance that each operator feels at one joint, over frequency.
 
     Each arm has two lines: the impedance while another arm is free, and while it is clamped.
 
     Args:
-        ports: Analysis of the ports, the places at which operators hold the arms.
-        joint: Number of the joint or axis, from 1.
+        ports: Analysis of the ports at which operators hold the arms.
+        joint: Number of the joint or axis, starting from 1.
         magnitude: Panel of the magnitude.
         phase: Panel of the phase.
     """
@@ -149,7 +150,7 @@ def _plot_impedance(ports: PortAnalysis, joint: int, magnitude: Axes, phase: Axe
 
 
 def _describe_ratios(ports: PortAnalysis, joint: int) -> str:
-    """Returns a line of a title with each site's ratio of clamped to free impedance, in dB."""
+    """Returns a title line with each site's ratio of clamped to free impedance, in dB."""
     ratios = [
         f"{response.operator_site} {response.ratio_db:+.1f} dB"
         for response in ports.transparency
@@ -171,20 +172,20 @@ def _convert_to_hz(w_rad_s: Array) -> Array:
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws over frequency whether the loop is passive, and stable with any passive operators.
+    """Draws whether the loop is passive, and stable with any passive operators, over frequency.
 
-    The upper panel shows the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
-    where Y is the admittance matrix of the ports: velocities over forces. A negative value
-    means that the loop can generate energy. With the value -1 it returns all energy that an
-    operator supplies.
+    The upper panel shows the smallest eigenvalue of Y + Y^H divided by its bound 2 norm(Y),
+    where Y is the admittance matrix of the ports (velocity per force). A negative value means
+    that the loop can generate energy. At -1, it returns all the energy that an operator
+    supplies.
 
-    The lower panel shows the criterion for stability with any passive operators: for two sites
-    Llewellyn's parameter of each joint, which must be at least 1; for more sites the margin
-    under the best weights, which must be positive.
+    The lower panel shows the criterion for stability with any passive operators. For two sites,
+    this is Llewellyn's parameter of each joint, which must be at least 1. For more sites, it is
+    the margin under the best weights, which must be positive.
 
     Args:
-        ports: Analysis of the ports, the places at which operators hold the arms.
-        size: Width, type sizes and resolution of the figure.
+        ports: Analysis of the ports at which operators hold the arms.
+        size: Width, font sizes and resolution of the figure.
     """
     if ports.verdict == "unstable":
         return style.empty_figure(
@@ -205,7 +206,7 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 
 def _list_passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
-    """Returns the legend entries of the figure of passivity."""
+    """Returns the legend entries for the passivity figure."""
     noun = "axes" if ports.axes else "joints"
     entries = [(f"all {noun}", _ALL)]
     entries += [
@@ -218,7 +219,7 @@ def _list_passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, An
 
 
 def _style_joint(joint: int) -> dict[str, Any]:
-    """Returns the options of the line of a joint."""
+    """Returns the line options of a joint."""
     return {
         "color": SITE_COLOURS[joint % len(SITE_COLOURS)],
         "linestyle": style.DASHES[joint % len(style.DASHES)],
@@ -227,22 +228,22 @@ def _style_joint(joint: int) -> dict[str, Any]:
 
 
 def _plot_over_hz(axes: Axes, w_rad_s: Array, values: Array, **options: Any) -> None:
-    """Draws values over angular frequencies, both of shape (F,), on an axis in Hz."""
+    """Plots values over angular frequencies, both of shape (F,), on an axis in Hz."""
     axes.semilogx(_convert_to_hz(w_rad_s), values, **options)
 
 
 def _shade_failures(axes: Axes, bands: Iterable[tuple[float, float]]) -> None:
-    """Shades the bands of frequency, in Hz, in which a curve lies below its limit."""
+    """Shades the frequency bands, in Hz, in which a curve is below its limit."""
     for band in bands:
         axes.axvspan(*band, **_FAILS)
 
 
 def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
-    """Draws the smallest eigenvalue of Y + Y^H over frequency, per joint and for all joints.
+    """Plots the smallest eigenvalue of Y + Y^H over frequency, per joint and for all joints.
 
-    Y is the admittance matrix of the places at which operators hold the arms. Eigenvalues below
-    0 mean that the arms could supply energy to an operator. They are divided by their bound 2
-    |Y|.
+    Y is the admittance matrix of the ports at which operators hold the arms. Eigenvalues below
+    0 mean that the arms could supply energy to an operator. They are divided by their bound,
+    which is twice the norm of Y.
     """
     curves = [(passivity, _style_joint(joint)) for joint, passivity in ports.joints.items()]
     if ports.proof is not None:
@@ -258,7 +259,7 @@ def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
 
 
 def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
-    """Draws Llewellyn's parameter of every joint, with the limit 1."""
+    """Plots Llewellyn's parameter of every joint, with the limit 1."""
     for two_port in ports.two_ports:
         line = _style_joint(two_port.joint)
         minima = two_port.minima
@@ -269,7 +270,7 @@ def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
 
 
 def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:
-    """Draws the smallest eigenvalue under the best weights, with the limit 0."""
+    """Plots the smallest eigenvalue under the best weights, with the limit 0."""
     minima = ports.absolute
     _plot_over_hz(axes, minima.w_rad_s, minima.values, **_ALL)
     _shade_failures(axes, minima.below)
@@ -285,9 +286,9 @@ _UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder":
 def draw_root_map(analysis: LinearAnalysis) -> Figure:
     """Draws the characteristic roots of the linearised control loop in the complex plane.
 
-    A root with a positive real part belongs to a motion that grows: the loop is unstable. This
-    half of the plane is shaded. The roots of the loop in continuous time and of the loop as it
-    is executed in ticks (control periods) have different marks.
+    A root with a positive real part belongs to a growing motion, which means that the loop is
+    unstable. This half of the plane is shaded. Different markers distinguish the roots of the
+    loop in continuous time from those of the loop as executed in ticks.
 
     Args:
         analysis: The linear analysis.
@@ -335,17 +336,17 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
 def _plot_roots(
     axes: Axes, roots: Sequence[complex], mark: str, colour: str, label: str
 ) -> None:
-    """Draws characteristic roots of a linear system in the complex plane.
+    """Plots characteristic roots of a linear system in the complex plane.
 
-    The system is unstable if any root has a positive real part. The conjugate of each complex
-    root is drawn too.
+    The system is unstable if any root has a positive real part. For each complex root, its
+    conjugate is plotted too.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        roots: The roots, of which each complex pair is listed once.
-        mark: Marker of Matplotlib.
+        roots: The roots. Each complex pair is listed only once.
+        mark: Matplotlib marker.
         colour: Colour of the markers.
-        label: Text in the legend.
+        label: Label in the legend.
     """
     conjugates = [root.conjugate() for root in roots if root.imag]
     all_roots = np.array([*roots, *conjugates])
@@ -363,15 +364,15 @@ def _plot_roots(
 _MARKS = ("o", "s", "^", "v")
 _LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersize": 5.0}
 _TRANSPORT_STEP = 0.22
-"""Distance between the transports of one case, relative to the distance between cases."""
+"""Distance between the transports of a case, relative to the distance between cases."""
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
-    """Draws the measured one-way delays of messages in a network, in ms, for several loads.
+    """Draws the measured one-way delays of a network, in ms, for several loads and transports.
 
-    A load (case) is a size of messages in bytes, and a number of messages per second. The load
-    that the benchmarked experiment needs is shaded. Transports are the protocols that were
-    measured.
+    A load (case) is a message size in bytes and a number of messages per second. The load
+    required by the benchmarked experiment is shaded. Transports are the network protocols that
+    were measured.
 
     Args:
         facts: Results of the network benchmark, from `NetworkBenchmark.to_dict`.
@@ -414,7 +415,7 @@ def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
 def _list_network_handles(
     rows: Sequence[Mapping[str, Any]], transports: Sequence[str]
 ) -> list[Line2D]:
-    """Returns the Matplotlib objects for the legend of network delays."""
+    """Returns the Matplotlib artists for the legend of network delays."""
     handles = []
     for number, name in enumerate(transports):
         handles.append(
@@ -433,16 +434,16 @@ def _list_network_handles(
 
 
 def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> None:
-    """Draws the delays of one transport in one case, and a cross if messages were lost.
+    """Plots the delays of one transport in one case, with a cross if messages were lost.
 
-    A mark is the median. A thick line leads from the median to the 99th percentile, and a thin
-    line to the largest delay.
+    The marker is the median. A thick line extends from the median to the 99th percentile, and a
+    thin line to the maximum.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
         x: Position along the axis of cases.
         row: Row of the benchmark.
-        transport: Number of the transport, on which its colour and its mark depend.
+        transport: Index of the transport, which determines its colour and marker.
     """
     times_us = row["one_way_us"]
     if times_us is not None:  # None if all messages were lost
@@ -460,7 +461,7 @@ def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> 
 
 
 def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
-    """Draws horizontal lines at the times with which the delays are to be compared, in ms.
+    """Draws horizontal lines at the times with which the delays should be compared, in ms.
 
     These are the tick period of the scenario, the time for which its links hold samples, and
     the ends of intervals of stable delays: of the first interval, and of those that contain a
@@ -505,15 +506,15 @@ _RUN_MARKS = {
     False: ("x", "run grows"),
     None: ("s", "run undecided"),
 }
-"""Mark and label of a run by `stable`."""
+"""Marker and label of a run, keyed by `stable`."""
 
 
 def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
     """Draws the largest stable stiffness of an arm that follows another arm over a delay.
 
     The horizontal axis is the delay. The vertical axis is the stiffness K of a joint divided by
-    its inertia, in 1/s^2. Marks show the gains that were chosen, and the simulated runs that
-    checked the largest stable stiffness.
+    its inertia, in 1/s^2. Markers show the chosen gains, and the simulated runs that verified
+    the largest stable stiffness.
 
     Args:
         facts: Results of the search for gains, from `ArmGains.to_dict`.

@@ -1,13 +1,13 @@
-"""Draws the figures of a log by name, and writes them to files for a paper or for a report.
+"""Draws the figures of a log by name, and writes them to files for a paper or a report.
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
-The modules of this folder register their figures with the decorator `figure_entry.draws`. This
-module imports all of them, so that `FIGURES` is complete.
+The modules of this folder register their figures with the decorator `figure_entry.draws`.
+Importing this module imports them all, which makes `FIGURES` complete.
 
 Invariant:
     - A figure depends only on a log and a figure size.
-    - Equal logs give files with equal bytes.
+    - Equal logs produce byte-identical files.
     - Every figure drawn by a module of this folder is in the registry.
 """
 
@@ -26,7 +26,7 @@ from ...log import Log, Progress, open_log
 from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize
 from ..style import DASHES, FIGURE_FORMATS, write_figure
 from .compared_runs import COMPARED_SIGNALS, draw_compared_runs, list_common_sites
-from .figure_entry import FigureEntry, list_figures
+from .figure_entry import FigureEntry
 from .joint_motion import draw_operator_displacement
 from .run_overview import draw_overlay
 from .twin_differences import draw_twins
@@ -35,16 +35,16 @@ from .twin_differences import draw_twins
 for _module in pkgutil.iter_modules(import_module(__package__).__path__):
     import_module(f"{__package__}.{_module.name}")
 
-FIGURES = list_figures()
+FIGURES = FigureEntry.list_all()
 """All figures by name, in the order in which they would appear in a paper."""
 
 
 def figure(
     log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN
 ) -> Figure:
-    """Returns a figure of a log for a paper, with a type size of 8 pt.
+    """Returns a figure of a log for a paper, with 8 pt text.
 
-    A notebook displays the figure as a picture. The command line has `trilat figure` for this.
+    Notebooks display the figure inline. The corresponding command is `trilat figure`.
 
     >>> drawn = tn.figure(tn.simulate("two_sites", duration_s=0.1), "positions")
     >>> drawn.savefig("positions.pdf")
@@ -66,7 +66,7 @@ def figure(
 def list_drawable_figures(log: Log) -> list[str]:
     """Lists the names of the figures for which a log has something to show.
 
-    For example, a run without walls has no figure of contact.
+    For example, a run without walls has no contact figure.
 
     Args:
         log: Log of the run.
@@ -84,16 +84,16 @@ def write_figures(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Draws figures of a log, and writes them to files with the sizes and fonts of a paper.
+    """Draws figures of a log and writes them to files, with the sizes and fonts of a paper.
 
     Args:
         log: Log of the run.
-        folder: Folder of the files. It is created if it does not exist.
+        folder: Folder for the files. Created if it does not exist.
         names: Names of figures. Empty for all figures for which the log has something to show.
         width_in: Width of the figures, 3.5 or 7 in.
-        formats: Formats of the files, of `FIGURE_FORMATS`.
+        formats: File formats, from `FIGURE_FORMATS`.
         force: True to overwrite existing files.
-        progress: Function that is called with the number of drawn figures and of all figures.
+        progress: Function that is called with the number of drawn figures and the total number.
 
     Returns:
         The paths of the files.
@@ -131,18 +131,18 @@ def write_overlay(
     formats: Sequence[str] = FIGURE_FORMATS[:2],
     force: bool = False,
 ) -> list[Path]:
-    """Writes figures that compare several runs, as overlay.pdf and overlay_positions.pdf.
+    """Writes figures that compare several runs, such as overlay.pdf and overlay_positions.pdf.
 
-    The figure "overlay" has the largest values of each run. The other figures have a panel per
-    arm and joint.
+    The figure "overlay" shows the largest values of each run. The other figures have one panel
+    per arm and joint.
 
     Args:
-        logs: The logs, by their names in the legend.
-        folder: Folder of the files. It is created if it does not exist.
+        logs: Mapping from the legend name of each run to its log.
+        folder: Folder for the files. Created if it does not exist.
         names: Names of the figures: overlay, positions, tracking_errors or control_torques. If
             empty, all of them are written, or only overlay if the others cannot show the runs.
         width_in: Width of the figures, 3.5 or 7 in.
-        formats: Formats of the files, of `FIGURE_FORMATS`.
+        formats: File formats, from `FIGURE_FORMATS`.
         force: True to overwrite existing files.
 
     Returns:
@@ -183,17 +183,16 @@ def write_report_figures(
 ) -> list[Path]:
     """Writes the figures of a run's report as PNG files.
 
-    Figures for which the log has nothing to show are left out. Earlier files in the folder are
+    Figures for which the log has nothing to show are omitted. Existing files in the folder are
     replaced.
 
     Args:
         log: Log of the run.
-        folder: Folder of the files. It is created if it does not exist.
-        twin: Log of the same run, repeated without operators, the people or programs that move
-            the arms. `None` to leave out the figure that shows how far operators moved the
-            arms.
-        progress: Function that is called with the number of drawn figures and of all figures.
-        pushed: How small pushes grow in repetitions of the run. `None` to compute this here.
+        folder: Folder for the files. Created if it does not exist.
+        twin: Log of the same run without operators. `None` to omit the figure that shows how
+            far operators moved the arms.
+        progress: Function that is called with the number of drawn figures and the total number.
+        pushed: Growth of small pushes in repetitions of the run. `None` to compute it here.
 
     Returns:
         The paths of the files.
@@ -231,11 +230,11 @@ def _write(
     does not leave an incomplete set of files.
 
     Args:
-        drawings: Functions that draw the figures, by the names of the files.
-        folder: Folder of the files. It is created if it does not exist.
+        drawings: Mapping from file name to the function that draws the figure.
+        folder: Folder for the files. Created if it does not exist.
         form: Size of the figures.
-        formats: Formats of the files, of `FIGURE_FORMATS`.
-        progress: Function that is called with the number of drawn figures and of all figures.
+        formats: File formats, from `FIGURE_FORMATS`.
+        progress: Function that is called with the number of drawn figures and the total number.
         force: True to overwrite existing files.
 
     Returns:
@@ -269,7 +268,7 @@ def _write(
 
 
 def _find_figure(log: Log, name: str) -> FigureEntry:
-    """Finds the figure with the name that a user gave.
+    """Looks up a figure by the name given by the user.
 
     Args:
         log: Log from which the figure will be drawn.

@@ -1,13 +1,12 @@
 """Draws an overview of one run, or compares several runs, in four panels over time.
 
-The panels show the largest tracking error, the largest joint speed, the largest torque and the
-age of the oldest state in use. An arm receives the states of other arms over the network, and
-the age of a state is the time since it was sent.
+The panels show the largest tracking error, the largest joint speed, the largest torque, and the
+age of the oldest sample in use.
 
 Invariant:
-    - In the figure of one run, each line is an arm.
-    - In the figure of several runs, each line is a run. The line shows the largest value of all
-      arms of the run at each time.
+    - In the figure of a single run, each line is an arm.
+    - In the figure of several runs, each line is a run and shows the largest value across all
+      arms at each time.
 """
 
 import textwrap
@@ -36,17 +35,17 @@ from .figure_entry import draws
 _HEIGHT_IN = 3.9
 _NARROW_HEIGHT_IN = 5.6
 _DECADES = 6.0
-"""Number of decades on the axis of errors. Errors below this range are far below the limit of
+"""Number of decades on the error axis. Errors below this range are far below the limit for
 settled sites.
 """
 _LETTERS_PER_IN = 15.0
-"""Average number of letters of the title per inch."""
+"""Average number of title letters per inch."""
 _MAX_SPANS = 1_000
-"""Largest number of spans of time for which the largest value of all sites is computed."""
+"""Maximum number of time spans for which the largest value of all sites is computed."""
 
 
 class _Panel(NamedTuple):
-    """One panel of the overview of a run: the quantity that it shows for every arm.
+    """One panel of the overview of a run, which shows one quantity of every arm.
 
     Attributes:
         name: Name of the quantity.
@@ -78,9 +77,9 @@ def _compute_largest_torque(log: Log, site: str) -> Array:
 
 
 def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
-    """Returns the age of the oldest state of another arm that a control loop used, in ms.
+    """Returns the age of the oldest peer sample in use at each record of a site, in ms.
 
-    The result has a value per record, shape (K,). It is NaN while no state was in use.
+    The result has shape (K,). It is NaN while no sample was in use.
     """
     ages_ms = plot_signals.sample_ages_ms(log, site)
     # NumPy prints a warning for a row of NaN only. Therefore -inf stands for unknown ages.
@@ -99,13 +98,13 @@ _PANELS = (
 
 @draws("overview", "errors, speeds, torques and ages of a run at a glance")
 def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the most important quantities of one run in four panels, with a line per arm.
+    """Draws the most important quantities of a run in four panels, with one line per arm.
 
-    The title contains the judgement on whether the run was stable, and the settling time.
+    The title contains the stability verdict and the settling time.
 
     Args:
         log: Log of the run.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     height_in = _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN
     with style.time_figure(log, form, height_in) as plot:
@@ -126,7 +125,7 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def _compose_title(log: Log, form: FigureSize) -> str:
-    """Returns the title of a run: its name, its stability and its settling time."""
+    """Returns the title of a run: its name, stability and settling time."""
     settling_times_s = [site_signals.settling_time_s(log[site]) for site in log.sites]
     settled_s = settling_time_of_all_s(settling_times_s)
     settling = "no settling time" if settled_s is None else f"settling time {settled_s:.1f} s"
@@ -138,14 +137,14 @@ def _compose_title(log: Log, form: FigureSize) -> str:
 
 
 def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws several runs over one another in one figure, to compare them.
+    """Draws several runs in one figure for comparison.
 
-    The figure has the four panels of a run's overview. Each panel has a line for each run, and
-    the legend names the settings in which the runs differ.
+    The figure has the same four panels as the overview of a run, with one line per run. The
+    legend lists the settings in which the runs differ.
 
     Args:
-        logs: Logs of the runs, by their names in the legend.
-        form: Width, type sizes and resolution of the figure.
+        logs: Mapping from the legend name of each run to its log.
+        form: Width, font sizes and resolution of the figure.
 
     Raises:
         UsageError: There is no log, or the errors of the runs have different units.
@@ -181,7 +180,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
 
 
 def _add_panels(figure: Figure, log: Log, form: FigureSize) -> list[Axes]:
-    """Adds the four labelled panels to a figure, two beside each other unless it is narrow."""
+    """Adds the four labelled panels to a figure, two side by side unless it is narrow."""
     rows = 4 if form.narrow else 2
     columns = len(_PANELS) // rows
     grid = style.add_panels(figure, rows, columns, sharex=True)
@@ -193,14 +192,15 @@ def _add_panels(figure: Figure, log: Log, form: FigureSize) -> list[Axes]:
 
 
 def _list_lowest(panels: list[Axes], form: FigureSize) -> list[Axes]:
-    """Returns the lowest panel of each column, which gets the time axis."""
+    """Returns the bottom panel of each column, which gets the time axis."""
     return panels[3:] if form.narrow else panels[2:]
 
 
 def _style_run(number: int) -> dict[str, Any]:
-    """Returns colour and dashes of the line that shows one of several runs.
+    """Returns the colour and dash pattern of the line for one of several runs.
 
-    Lines are solid until every colour is used. Further runs have the same colours with dashes.
+    Lines are solid until every colour has been used. Further runs reuse the colours with
+    dashes.
     """
     repetition = number // len(SITE_COLOURS)
     return {
@@ -211,13 +211,13 @@ def _style_run(number: int) -> dict[str, Any]:
 
 
 def _compute_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
-    """Returns the largest value of all arms of a run over time, as one curve per run.
+    """Returns the largest value across all arms of a run over time, as a single curve.
 
-    Time is divided into equal spans, and the curve has a point per span. In this way, several
-    runs can be compared in one panel.
+    The time axis is divided into equal spans with one point each. With one curve per run,
+    several runs can be compared in one panel.
 
     Returns:
-        Middles of the spans in s, and largest values, each of shape (S,). The value of a span
+        Centres of the spans in s, and largest values, each of shape (S,). The value of a span
         without records is NaN.
     """
     # Spans are so long that each has at least two records of every site on average.
@@ -239,7 +239,7 @@ def _select_drawable(panel: _Panel, values: Array) -> Array:
 
 
 def _scale_axis(axes: Axes, panel: _Panel, columns: list[Array]) -> None:
-    """Scales the value axis of a panel so that all of its lines fit.
+    """Scales the value axis of a panel to fit all of its lines.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

@@ -1,16 +1,15 @@
 """Draws how a small disturbance of a run grows or decays over time.
 
-The run was repeated with a small push at some time. Such a repetition is called a twin. The
-upper panel shows the differences between the joint velocities of twin and run on a logarithmic
-axis, on which exponential growth is a straight line. The slope of a dashed line next to them is
-the growth rate that the headline states. The lower panel shows the joint speeds of the run
-itself.
+Twins are repetitions of the run with a small push at some time. The upper panel shows the
+differences in joint velocity between each twin and the run on a logarithmic axis, on which
+exponential growth is a straight line. The slope of the dashed line next to them is the growth
+rate given in the headline. The lower panel shows the joint speeds of the run itself.
 
 Invariant:
-    - The differences are drawn as they were measured.
-    - The dashed line covers the times over which its rate was fitted.
-    - If a twin was pushed again, because its difference had decayed to rounding errors, its
-      line is interrupted there.
+    - The differences are drawn as measured.
+    - The dashed line covers the time interval over which its rate was fitted.
+    - The line of a twin is interrupted where the twin was pushed again because its difference
+      had decayed to rounding errors.
 """
 
 import textwrap
@@ -31,7 +30,6 @@ from ...analysis import (
     PushGrowth,
     RunEnd,
     TwinGrowth,
-    measure_amplitude,
 )
 from ...core import BUCKETS_PER_S, Array
 from ...execution import SMALLEST, FusedRun, TwinPath, Twins
@@ -41,7 +39,7 @@ from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
 
 _POINTS = 150
-"""Approximate number of points of a line. Each is the largest value around its time."""
+"""Approximate number of points on a line. Each is the largest value around its time."""
 _SEVERAL_JOINTS_COLOUR = "#7a7a7a"
 """Colour of pushes that move several joints."""
 _ESTIMATES_COLOUR = "#999933"
@@ -66,35 +64,36 @@ _NOTE: dict[str, Any] = {
 
 
 class _DifferenceLine(NamedTuple):
-    """A line that shows how far a run and its repetition with a small push are apart.
+    """A line that shows the difference between a run and its repetition with a small push.
 
-    If the line grows, small pushes grow, and the run is not stable.
+    If the line rises, small pushes grow, and the run is not stable.
 
     Attributes:
-        label: Text of the line in the legend.
+        label: Label of the line in the legend.
         path: Difference between the repetition (twin) and the run over time.
-        joints: Indices of the joints that the drawn amplitude covers.
-        options: Colour, width and dashes of the line.
+        log_amplitude: Logarithm of the plotted amplitude in rad/s over time, for one joint or
+            for all joints, shape (K,).
+        options: Colour, width and dash pattern of the line.
     """
 
     label: str
     path: TwinPath
-    joints: list[int]
+    log_amplitude: Array
     options: dict[str, Any]
 
 
 def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws how small pushes grow or decay in repetitions of a run.
 
-    Each repetition, called a twin, equals the run except for a small push. The upper panel
-    shows the differences between the joint velocities of the twins and of the run, in rad/s. It
-    has a line for each push, or a line for each joint if there was a single push. The lower
-    panel shows the joint speeds of the run. If there are no twins, the figure shows the reason.
-    The title is a sentence on how the pushes develop.
+    Each repetition (twin) is identical to the run except for a small push. The upper panel
+    shows the differences in joint velocity between the twins and the run, in rad/s, with one
+    line per push, or one line per joint if there was only one push. The lower panel shows the
+    joint speeds of the run. If there are no twins, the figure shows the reason. The title
+    describes in a sentence how the pushes develop.
 
     Args:
         pushed: The run and its twins.
-        form: Width, type sizes and resolution of the figure.
+        form: Width, font sizes and resolution of the figure.
     """
     growth = pushed.growth
     if growth.twins is None or growth.worst is None:
@@ -143,17 +142,17 @@ def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
 def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
     """Yields the lines of the panel that shows the differences between twins and their run.
 
-    - If pushes of several sizes were tried, to find those that act linearly, each size has a
-      line, from light to dark.
-    - Several pushes have a line each. The push of one joint has the style of that joint.
-    - A single push has a line per joint that it moved.
+    - If pushes of several sizes were tried in order to find those that act linearly, each size
+      has one line, from light to dark.
+    - Several pushes have one line each. The push of a single joint has the style of that joint.
+    - A single push has one line per joint that it moved.
 
     Args:
         pushed: The run and its pushed twins.
         twins: The twins of `pushed`, each with its push and its difference from the run over
             time.
     """
-    all_joints = list(range(len(twins.joints)))
+    log_amplitudes = pushed.measure_amplitudes(range(len(twins.joints)))
     joint_styles = _style_joints(pushed.log, twins.joints)
     shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(twins.paths)))
     has_several_sizes = pushed.linear is not None
@@ -163,7 +162,7 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
         size, _, pushed_joints = path.push.name.partition(" at ")
         if has_several_sizes:
             shade = {"color": tuple(shades[number]), "linewidth": 1.3}
-            yield _DifferenceLine(size, path, all_joints, shade)
+            yield _DifferenceLine(size, path, log_amplitudes[number], shade)
         elif len(twins.paths) > 1:
             style_without_joint = {
                 "color": _SEVERAL_JOINTS_COLOUR if pushed_joints else _ESTIMATES_COLOUR,
@@ -171,13 +170,14 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
                 "linestyle": style.DASHES[number % len(style.DASHES)],
             }
             options = joint_styles.get(pushed_joints, style_without_joint)
-            yield _DifferenceLine(path.push.name, path, all_joints, options)
+            yield _DifferenceLine(path.push.name, path, log_amplitudes[number], options)
         else:
             for joint, name in enumerate(twins.joints):
                 # The logarithm of the difference is -inf while the joint has not moved.
                 has_moved = np.isfinite(path.largest[:, joint]).any()
                 if has_moved:
-                    yield _DifferenceLine(name, path, [joint], joint_styles[name])
+                    (log_amplitude,) = pushed.measure_amplitudes([joint])
+                    yield _DifferenceLine(name, path, log_amplitude, joint_styles[name])
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -199,9 +199,9 @@ def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
 def _draw_differences(
     axes: Axes, pushed: PushedTwins, lines: Sequence[_DifferenceLine], rated: PushGrowth
 ) -> None:
-    """Draws how far a run and its slightly pushed repetitions (twins) are apart over time.
+    """Draws the differences between a run and its slightly pushed repetitions over time.
 
-    The growth rate of one push is drawn beside the lines of this push.
+    The growth rate of one push is drawn next to its lines.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -233,25 +233,24 @@ def _draw_differences(
 def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Array, Array]:
     """Computes the points of a line that shows the difference between a run and its twin.
 
-    A twin is a repetition of the run that received a small push. The difference is known in
-    intervals of 50 ms, and a point shows the largest difference of several intervals. A
-    difference that has decayed to rounding errors is pushed again. The line is interrupted
-    between the parts (legs) from one push to the next.
+    The difference is known in intervals of 50 ms, and each point shows the largest difference
+    of several intervals. After a difference has decayed to rounding errors, the twin is pushed
+    again. The line is interrupted between the legs from one push to the next.
 
-    The computation uses logarithms, because the difference of a run in which disturbances grow
-    exponentially may exceed the range of floating-point numbers.
+    The computation uses logarithms, because exponentially growing differences may exceed the
+    range of floating-point numbers.
 
     Args:
         line: The line.
         to_s: End of the line, in s.
-        step: Number of intervals that a point covers.
+        step: Number of intervals per point.
 
     Returns:
-        Times in s and amplitudes in rad/s, each of shape (K,). The line is interrupted where an
-        amplitude is NaN: at the end of each leg, and where the difference is 0.
+        Times in s and amplitudes in rad/s, each of shape (K,). An amplitude is NaN, which
+        interrupts the line, at the end of each leg and where the difference is 0.
     """
     path = line.path
-    log_amplitude = measure_amplitude(path, line.joints)
+    log_amplitude = line.log_amplitude
     end = int(np.searchsorted(path.t_s, to_s))
     end = max(end, path.pushed[-1] + 1)  # the last leg has at least one interval
     t_s = np.zeros(0)
@@ -273,8 +272,8 @@ def _draw_rate(
 ) -> None:
     """Draws a dashed line with the growth rate of a push, just above the differences.
 
-    The value of the rate is written next to the line. Nothing is drawn if the push has no rate
-    or no clear trend.
+    The rate is written next to the line. Nothing is drawn if the push has no rate or no clear
+    trend.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
@@ -317,15 +316,15 @@ def _draw_rate(
 
 
 def _limit_differences(axes: Axes, form: FigureSize) -> None:
-    """Labels and limits the logarithmic axis of the differences.
+    """Labels the logarithmic axis of the differences and sets its limits.
 
-    Differences below `SMALLEST` consist of rounding errors. If any difference comes near this
-    value, the axis begins a decade below it, and this decade is shaded. The axis spans at least
-    a factor of 30, so that slow growth does not look fast.
+    Differences below `SMALLEST` consist of rounding errors. If any difference comes close to
+    this value, the axis starts one decade below it, and this decade is shaded. The axis spans
+    at least a factor of 30, so that slow growth does not look fast.
 
     Args:
-        axes: Panel of the figure, as Matplotlib axes, in which the lines are already drawn.
-        form: Width, type sizes and resolution of the figure.
+        axes: Panel of the figure, as Matplotlib axes, with the lines already drawn.
+        form: Width, font sizes and resolution of the figure.
     """
     axes.set_ylabel("difference of velocities (rad/s)")
     low, high = axes.get_ylim()
@@ -361,8 +360,7 @@ def _mark_push(axes: Axes, at_s: float, form: FigureSize) -> None:
 def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
     """Draws the speed of the fastest joint of every arm, in rad/s.
 
-    The panel above shows how the differences between the run and its slightly pushed
-    repetitions change. Both panels have the same time axis.
+    The time axis is the same as that of the differences in the panel above.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.

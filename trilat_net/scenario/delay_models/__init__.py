@@ -1,22 +1,22 @@
-"""Defines what the delay models of all network links have in common: loss, duplicates, outages.
+"""Common base of all delay models of network links, including loss, duplication and outages.
 
-A link carries the state of one arm to another arm. Its delay model computes how long each
-message takes, for example "uniform between 10 ms and 20 ms". Each model is one class in a file
-of this folder. There is no list of models: to add one, add a file.
+A delay model computes how long each message takes, for example "uniform between 10 ms and 20
+ms". Each model is a class in its own file in this folder; adding a file adds a model.
 
-A model that the simulation kernel computes itself names a `DelayKind`. Any other model has its
-own function, which is compiled.
+A model that is built into the simulation kernel names its `DelayKind`. Other models define a
+function of their own, which is compiled.
 
 Invariant:
     - Each model states the mean and the standard deviation of its delay in closed form. The
       kernel draws from exactly the distribution that has these moments.
-    - The loss of samples is described by two measurable quantities: the fraction of lost
-      samples and the mean length of bursts. The parameters of the two-state Markov chain that
-      draws the losses follow from them in closed form.
+    - Sample loss is described by two measurable quantities: the fraction of lost samples and
+      the mean burst length. The parameters of the two-state Markov chain that draws the losses
+      are derived from them in closed form.
     - The name of a key ends in its unit.
 """
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union
 
 import numpy as np
@@ -26,7 +26,10 @@ from ...core import (
     LINK_MODEL_DTYPE,
     MAX_DELAY_US,
     DelayKind,
+    IntArray,
     LinkModel,
+    LinkSchedule,
+    LinkSetup,
     Points,
     UserModel,
 )
@@ -36,7 +39,7 @@ MAX_DELAY_MS = MAX_DELAY_US / 1000
 """Longest delay of a link, in ms."""
 
 MAX_OUTAGES = 1000
-"""Largest number of outages of a link, because each sample is compared with all of them."""
+"""Largest number of outages of a link; each sample is compared with all of them."""
 
 Milliseconds = Annotated[float, Meta(ge=0.0, le=MAX_DELAY_MS)]
 Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -44,17 +47,16 @@ OutageTime = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
 class _DelayMoments(NamedTuple):
-    """Mean and standard deviation of the random delay of a link, both in ms."""
+    """Mean and standard deviation of the random delay of a link, in ms."""
 
     mean_ms: float
     deviation_ms: float
 
 
 def ms_to_us(milliseconds: float) -> int:
-    """Converts a time in milliseconds to whole microseconds.
+    """Converts a time in milliseconds to microseconds, rounded to an integer.
 
-    Delays are rounded, because the compiled simulation must give the same bits on every
-    machine.
+    Integer delays make the compiled simulation reproduce the same bits on every machine.
     """
     return round(milliseconds * 1_000)
 
@@ -65,20 +67,20 @@ _DETERMINISTIC_KINDS = (
     DelayKind.TRACE,
     DelayKind.MEASURED,
 )
-"""Delays that are not drawn at random."""
+"""Delay kinds that are not random."""
 
 
 class _LossChain(NamedTuple):
-    """Markov chain that decides which messages a simulated network loses, in bursts.
+    """Markov chain that determines which messages a simulated network loses in bursts.
 
-    The network is either in a good or in a bad state (Gilbert's model). Its state may change
-    from message to message, and each state has its own probability of losing a message.
+    The network is in either a good or a bad state (Gilbert's model). The state can change from
+    one message to the next, and each state has its own loss probability.
 
     Attributes:
         loss_good: Probability that a sample is lost in the good state.
         loss_bad: Probability that a sample is lost in the bad state.
-        enter: Probability per sample to change from the good to the bad state.
-        leave: Probability per sample to change from the bad to the good state.
+        enter: Probability per sample of a transition from the good to the bad state.
+        leave: Probability per sample of a transition from the bad to the good state.
     """
 
     loss_good: float
@@ -88,24 +90,22 @@ class _LossChain(NamedTuple):
 
 
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """Network link from one arm's process to another's, with everything except the delay.
+    """Settings of a network link between two sites, apart from its delay.
 
-    Each process sends its state once per control period, as a sample. The link states how many
-    samples are lost, duplicated or reordered. A subclass defines the delay by overriding the
-    methods whose names begin with an underscore.
+    They specify how many samples are lost, duplicated or reordered. Subclasses define the delay
+    by overriding the methods whose names begin with an underscore.
 
     Attributes:
-        loss: Fraction of samples that are lost in the long run.
-        loss_burst: Mean number of consecutive lost samples. 0 means that losses are
-            independent.
-        loss_bad: Fraction of the samples of a burst that are lost. Below 1, bursts have gaps.
-        duplicate: Fraction of samples that arrive twice. The copy has its own delay.
-        outages_s: Intervals in which all samples are lost, in s. A sample belongs to an
-            interval by its send time.
-        order: "newest": A newer sample replaces an older one that arrives later. "in_order": A
-            sample does not overtake an older one.
-        playout_ms: Shortest time for which every sample is held, in ms. Delays below this time
-            all become equal, so jitter disappears.
+        loss: Long-run fraction of samples that are lost.
+        loss_burst: Mean number of consecutive lost samples. If 0, losses are independent.
+        loss_bad: Fraction of samples lost within a burst. If below 1, bursts have gaps.
+        duplicate: Fraction of samples that arrive twice. The delay of the copy is drawn
+            separately.
+        outages_s: Intervals of send time, in s, in which every sample is lost.
+        order: "newest" to discard a sample that arrives after a newer one, or "in_order" to
+            hold back a sample until the earlier ones have arrived.
+        playout_ms: Play-out delay, in ms. Every sample is held until at least this long after
+            it was sent, which removes the jitter of all shorter delays.
     """
 
     loss: Probability = 0.0
@@ -120,24 +120,25 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:  # noqa: ARG003 - subclasses use it
-        """Returns the keys that an author may leave out because they follow from other keys.
+        """Returns defaults for keys that can be computed from other keys.
 
-        A delay model with such keys overrides this method. By default, there are none.
+        A delay model that has such keys overrides this method. Returns an empty table by
+        default.
 
         Args:
-            table: Table of the link as its author wrote it.
+            table: The link table as written by its author.
         """
         return {}
 
     @property
     def constant_delay_ms(self) -> float | None:
-        """Delay of every message, in ms, if all messages have the same. Otherwise None."""
+        """Delay of every message, in ms, or None if the delay varies."""
         return None
 
     def _delay(self) -> LinkModel:
-        """Returns the delay of the link in the format that the compiled simulation reads.
+        """Returns the delay of the link in the format read by the compiled simulation.
 
-        Losses are not included; `to_core_model` adds them.
+        Excludes losses, which are added by `to_core_model`.
         """
         raise NotImplementedError
 
@@ -146,65 +147,56 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         raise NotImplementedError
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay of a message on the link, ms.
+        """Returns the longest delay of a message on the link, in ms.
 
-        A distribution without an upper limit is cut at three standard deviations above its
-        mean.
+        An unbounded distribution is cut off three standard deviations above its mean.
         """
         mean_ms, deviation_ms = self._moments()
         return mean_ms + 3.0 * deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a contradiction between several keys of the delay, or None."""
+        """Returns a contradiction between keys of the delay, or None."""
         return None
 
     def _describe_delay(self) -> str:
-        """Returns a short text for users about the delay, with mean and standard deviation."""
+        """Returns a short description of the delay, with its mean and standard deviation."""
         mean_ms, deviation_ms = self._moments()
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
     def moments(self) -> _DelayMoments:
-        """Mean and standard deviation of the random delay that a link is described with.
+        """Mean and standard deviation of the delay distribution configured for the link.
 
-        A link is the one-way network connection between two sites, the processes of the arms.
-        The delay in a run can differ, because three effects are not included: the hold time
-        `playout_ms`, the enforced order of messages (`order`), and the upper limit of all
-        delays, `MAX_DELAY_MS`.
+        The delay in a run can differ, since three effects are not included: the play-out delay
+        `playout_ms`, in-order delivery (`order`), and the upper limit on all delays,
+        `MAX_DELAY_MS`.
         """
         return _DelayMoments(*self._moments())
 
     @property
     def random(self) -> bool:
-        """True if the network link draws its delays, losses or duplicates at random.
+        """True if delays, losses or duplicates of the link are random.
 
-        Another seed then gives another run. Losses are random only if some messages are lost,
-        but not all.
+        The run then depends on the seed. Losses are random only if the loss fraction is between
+        0 and 1, exclusive.
         """
         is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
         return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
 
     @property
     def measured(self) -> bool:
-        """True if the link adds no artificial delay.
+        """True if the link adds no artificial delay to that of the real network.
 
-        Samples then arrive as the real network of a live session delivers them. Such a link
-        cannot be simulated without the log of a session.
+        Such a link cannot be simulated without the log of a live session.
         """
         return self._delay().kind == DelayKind.MEASURED
 
     @property
     def points(self) -> Points | None:
-        """Measured delays over time, for a link that repeats a recorded trace of delays.
-
-        A link is the one-way network connection between two sites, the processes of the arms.
-        The value is None for links whose delay is not recorded.
-        """
+        """Recorded delays over time, for a link that replays a delay trace; otherwise None."""
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Converts the delay and losses of a link to numbers for the compiled simulation.
-
-        The simulation draws the random delays and losses from them.
+        """Converts the link to the parameters used to simulate delays and losses.
 
         Args:
             from_ns: Send time of the first message to which these settings apply, in ns after
@@ -222,17 +214,34 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
             playout_us=ms_to_us(self.playout_ms),
         )
 
-    def _loss_chain(self) -> _LossChain:
-        """Computes the Markov chain that produces the stated losses.
+    def find_effective_delay(self, receiver_hz: int) -> float:
+        """Returns the delay with which the receiver of the link uses samples, in s.
 
-        In the bad state, a sample is lost with the probability h = `loss_bad`; in the good
-        state, never. A run of lost samples continues with the probability (1 - leave) h. Its
-        mean length is therefore
+        A constant delay is rounded up to a multiple of the receiver's control period. Returns
+        NaN if the delay varies or the link loses samples.
+
+        Args:
+            receiver_hz: Tick rate of the receiver, in Hz.
+        """
+        model = self.to_core_model()
+        if model.kind != DelayKind.CONSTANT or self.loss or self.measured:
+            return math.nan
+        delay_us = max(round(model.location), model.playout_us)
+        # rounded up, because without a delay a sample is used from the next tick on
+        ticks = max(1, -(-delay_us * receiver_hz // 1_000_000))
+        return ticks / receiver_hz
+
+    def _loss_chain(self) -> _LossChain:
+        """Computes the Markov chain that produces the configured losses.
+
+        A sample is lost with probability h = `loss_bad` in the bad state, and never in the good
+        state. A run of lost samples continues with probability (1 - leave) h. Its mean length
+        is therefore
 
             B = 1 / (1 - (1 - leave) h), so that leave = 1 - (1 - 1 / B) / h.
 
-        The fraction of samples in the bad state is loss / h = enter / (enter + leave), from
-        which the probability `enter` follows.
+        The fraction of samples in the bad state is loss / h = enter / (enter + leave), which
+        determines `enter`.
         """
         if self.loss_burst == 0.0 or self.loss == 0.0:
             return _LossChain(loss_good=self.loss, loss_bad=0.0, enter=0.0, leave=1.0)
@@ -242,13 +251,13 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return _LossChain(loss_good=0.0, loss_bad=self.loss_bad, enter=enter, leave=leave)
 
     def find_problem(self) -> KeyProblem | None:
-        """Returns a contradiction between several keys of the link, if there is one.
+        """Checks the keys of the link for contradictions between them.
 
-        For example, an outage must not end before it starts. Problems of a single key are found
-        earlier, by the type of the key.
+        For example, an outage must not end before it starts. Single keys have already been
+        checked by their types.
 
         Returns:
-            The key and the reason. None if the keys agree with each other.
+            The key and the reason, or None if the keys are consistent.
         """
         delay_problem = self._find_delay_problem()
         if delay_problem is not None:
@@ -270,10 +279,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return None
 
     def _find_burst_problem(self) -> KeyProblem | None:
-        """Returns a problem if the stated losses in bursts are impossible.
+        """Returns a problem if the configured burst losses are impossible, or None.
 
-        The losses are modelled by a Markov chain, which alternates between good times and
-        bursts. The result is None if such a chain can produce the stated losses.
+        They are impossible if no Markov chain that alternates between good and bad periods can
+        produce them.
         """
         if self.loss_burst < 1.0:
             return KeyProblem(
@@ -298,11 +307,43 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
             )
         return None
 
-    def describe(self) -> str:
-        """Returns a short text for the user about the link.
+    @lru_cache(maxsize=256)  # noqa: B019 - a link is a small value that never changes
+    def draw_used_samples(
+        self, key: int, receiver_hz: int, sender_hz: int, duration_s: float
+    ) -> IntArray:
+        """Computes which sample of the peer is in use in each tick of the receiver.
 
-        It contains the kind of the delay with its mean and standard deviation, and the other
-        properties that the link has, such as losses.
+        Accounts for delays and losses of this link only; other links of the receiver are
+        ignored.
+
+        Args:
+            key: Key of the link's random draws.
+            receiver_hz: Tick rate of the receiving site, in Hz.
+            sender_hz: Tick rate of the peer, in Hz.
+            duration_s: Duration of the run, in s.
+
+        Returns:
+            Index of the sample in use at every tick, shape (ticks,); -1 before the first
+            sample.
+        """
+        setup = LinkSetup(
+            peer="peer",
+            alpha=1.0,
+            rate_hz=sender_hz,
+            q0=(),
+            key=key,
+            models=(self.to_core_model(),),
+            traces=(self.points,),
+        )
+        used = LinkSchedule(setup).draw_run(receiver_hz, duration_s)
+        used.flags.writeable = False
+        return used
+
+    def describe(self) -> str:
+        """Returns a short human-readable description of the link.
+
+        Contains the kind of delay with its mean and standard deviation, and any other
+        properties of the link, such as losses.
         """
         parts = [self._describe_delay()]
         if self.loss:
@@ -320,10 +361,10 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
 
 class OwnDelay(LinkBase, frozen=True, kw_only=True):
-    """Delay model that consists of a Python file with a function for the delay of one message.
+    """Base class for a delay model that computes the delay of one message in Python.
 
-    To add a model, a contributor adds a file to this folder with a subclass. The attributes of
-    the class are the numerical settings of the model. The subclass defines
+    To add a model, add a file with a subclass to this folder. The attributes of the class are
+    the numeric settings of the model. The subclass defines
 
     - `draw`, which computes the delay of one message,
     - `_moments`, which returns the mean and standard deviation of the delay in ms,
@@ -332,43 +373,41 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
     """
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of one message, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one message and stores it in `now.drawn_us`, in microseconds.
 
-        A sample is the state that a site publishes in one tick. This method is compiled. It may
-        use `now.sample`, the number of the sample, and `now.stamp_ns`, its send time. Random
-        numbers must come from `core.links.delay.draw_pair`: they are a function of the key of
-        the link and an index, so that a repeated run draws the same numbers (law L4 of
-        docs/develop/design.md).
+        This method is compiled. It may use the sample number `now.sample` and the send time
+        `now.stamp_ns`. Draw random numbers with `core.links.delay.draw_pair` only: its results
+        depend only on the key of the link and an index, so a repeated run draws the same
+        numbers (law L4 of docs/develop/design.md).
 
         Args:
-            now: The sample, and the field for the result.
+            now: The sample, and the field that receives the result.
         """
         raise NotImplementedError
 
     @property
     def points(self) -> Points:
-        """Numerical settings of this delay model, packed for the compiled simulation.
+        """Numeric settings of the delay model, packed for the compiled simulation.
 
-        The compiled simulation has one table of integers for each link. A link with recorded
-        delays stores its measurements there. This model stores its floating-point settings bit
-        by bit in the same table, two in each row.
+        The compiled simulation has one integer table per link, which normally holds a recorded
+        delay trace. The bit patterns of the floating-point settings are stored in this table,
+        two per row.
         """
         numbers = UserModel(self).numbers
         rows = math.ceil(max(len(numbers), 1) / 2)
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
-        """Returns the delay in the format that the compiled simulation reads.
+        """Returns the delay in the format read by the compiled simulation.
 
         The parameter `location` is the longest delay, in microseconds.
         """
         return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Converts the link to the record that the compiled simulation reads.
+        """Converts the link to the record read by the compiled simulation.
 
-        The record contains the address of the compiled method `draw`, which computes the
-        delays.
+        The record contains the address of the compiled `draw` method.
 
         Args:
             from_ns: Send time of the first message to which these settings apply, in ns after
@@ -380,7 +419,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
 
 
 DELAY_MODELS = {str(kind.__struct_config__.tag): kind for kind in LinkBase.find_kinds(__name__)}
-"""Classes of all delay models, by the name of the model."""
+"""Mapping from name to class of all delay models."""
 if TYPE_CHECKING:
     Link = LinkBase
 else:

@@ -1,14 +1,12 @@
-"""Defines the network delay models that the simulation kernel computes itself.
+"""Delay models that are built into the simulation kernel.
 
-The author of an experiment gives the delay of each network link as a table, for example with a
-mean and a jitter. Each class of this module represents one kind of table. It translates the
-keys to the parameters of a probability distribution or of a function of time, and states the
-mean and the standard deviation of the delay.
+Each class describes one kind of link table, for example a table with a mean and a jitter. It
+converts the keys to the parameters of a probability distribution or of a function of time, and
+computes the mean and the standard deviation of the delay.
 
 Invariant:
-    - Each model names the `DelayKind` by which the kernel, the compiled simulation, knows it.
-      The kernel draws delays from exactly the distribution whose mean and standard deviation
-      the model states.
+    - Each model names its `DelayKind` in the kernel, the compiled simulation. The kernel draws
+      delays from exactly the distribution whose mean and standard deviation the model states.
 """
 
 import math
@@ -25,7 +23,7 @@ from . import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
-"""Standard deviation. It is at least a microsecond, because delays are whole microseconds."""
+"""Standard deviation, at least 1 microsecond since delays are integers in microseconds."""
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
@@ -35,12 +33,12 @@ def _normal_density(x: float) -> float:
 
 
 def _normal_probability(x: float) -> float:
-    """Returns the probability that a standard normal random number is below `x`."""
+    """Returns the probability that a standard normal random variable is below `x`."""
     return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
-    """Delay of each message drawn uniformly between the mean minus and plus a half width.
+    """Delay drawn uniformly from mean minus half width to mean plus half width.
 
     For example, a mean of 50 ms and a half width of 10 ms give delays from 40 to 60 ms.
 
@@ -55,15 +53,13 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:
-        """Returns the default width of the distribution: half of the mean to each side.
-
-        Because of this default, the description of a link may state the mean delay alone.
+        """Returns the default half width: half of the mean delay.
 
         Args:
-            table: Settings of the link as the author of the scenario wrote them.
+            table: The link table as written by its author.
 
         Returns:
-            The setting `half_width_ms`. Empty if the mean is missing or not a number.
+            The key `half_width_ms`. Empty if the mean is missing or not a number.
         """
         delay_ms = table.get("delay_ms")
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
@@ -75,13 +71,13 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         )
 
     def _describe_delay(self) -> str:
-        """Returns the limits of the delay, for example "uniform 0 to 400 ms"."""
+        """Returns the range of the delay, for example "uniform 0 to 400 ms"."""
         least_ms = self.delay_ms - self.half_width_ms
         most_ms = self.delay_ms + self.half_width_ms
         return f"uniform {least_ms:.4g} to {most_ms:.4g} ms"
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation, half_width / sqrt(3), in ms."""
+        """Returns the mean and the standard deviation half_width / sqrt(3), in ms."""
         return self.delay_ms, self.half_width_ms / math.sqrt(3.0)
 
     def _reach_ms(self) -> float:
@@ -89,20 +85,20 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return self.delay_ms + self.half_width_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the half width exceeds the mean, as delays would be negative."""
+        """Returns a problem if the half width exceeds the mean, giving negative delays."""
         if self.half_width_ms > self.delay_ms:
             return KeyProblem("half_width_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
-    """Delay of each message drawn from a normal distribution that is cut off at zero.
+    """Delay drawn from a normal distribution truncated at zero.
 
-    A message cannot arrive before it was sent. Therefore a negative delay is drawn again.
+    A message cannot arrive before it was sent, so negative delays are redrawn.
 
     Attributes:
-        delay_ms: Mean of the normal distribution, before negative delays are excluded, in ms.
-        deviation_ms: Standard deviation of this distribution, in ms.
+        delay_ms: Mean of the normal distribution before truncation, in ms.
+        deviation_ms: Standard deviation of the normal distribution before truncation, in ms.
     """
 
     delay_ms: Milliseconds
@@ -117,10 +113,10 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and the standard deviation of the delay, in ms.
 
-        They are those of the normal distribution truncated at zero. Let m and s be the mean and
-        the standard deviation before the truncation, a = -m / s, phi the standard normal
-        density, Phi its integral, and H = phi(a) / Phi(-a) the hazard. Then the mean is m + s
-        H, and the standard deviation is s sqrt(1 + a H - H^2).
+        The normal distribution is truncated at zero. Let m and s be its mean and standard
+        deviation before truncation, a = -m / s, phi the standard normal density, Phi its
+        integral, and H = phi(a) / Phi(-a) the hazard. The mean is then m + s H, and the
+        standard deviation is s sqrt(1 + a H - H^2).
         """
         a = -self.delay_ms / self.deviation_ms
         hazard = _normal_density(a) / _normal_probability(-a)
@@ -129,7 +125,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
 
 
 class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
-    """Base of the delay models whose author states the mean and the standard deviation.
+    """Base class for delay models configured with a mean and a standard deviation.
 
     Attributes:
         delay_ms: Mean delay, in ms.
@@ -140,13 +136,13 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
     deviation_ms: Deviation
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation that the author stated, in ms."""
+        """Returns the configured mean and standard deviation, in ms."""
         return self.delay_ms, self.deviation_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the ratio of deviation and mean is extreme.
+        """Returns a problem if the ratio of standard deviation to mean is extreme.
 
-        The deviation must be between 1/1000 of the mean and 10 times the mean.
+        The standard deviation must be between 1/1000 of the mean and 10 times the mean.
         """
         delay_ms, deviation_ms = self._moments()
         if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
@@ -158,32 +154,33 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """Delay of each message drawn from a gamma distribution: never negative, with a long tail.
+    """Delay drawn from a gamma distribution: never negative, with a long tail.
 
-    The author of a scenario states the mean and the standard deviation.
+    Configured with the mean and the standard deviation of the delay.
     """
 
     def _delay(self) -> LinkModel:
         """Returns the parameters from which the compiled simulation draws the delays.
 
-        For the mean m and the standard deviation s, the shape of the gamma distribution is m^2
-        / s^2, and its scale is s^2 / m.
+        For mean m and standard deviation s, the gamma distribution has shape m^2 / s^2 and
+        scale s^2 / m.
         """
         shape = (self.delay_ms / self.deviation_ms) ** 2
         return LinkModel(kind=DelayKind.GAMMA, extra=shape, scale=1e3 * self.delay_ms / shape)
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Delay whose logarithm is normally distributed: mostly short, and very long at times.
+    """Delay drawn from a log-normal distribution: mostly short, occasionally very long.
 
-    The author of a scenario states the mean and the standard deviation of the delay itself.
+    Configured with the mean and the standard deviation of the delay itself, not of its
+    logarithm.
     """
 
     def _delay(self) -> LinkModel:
         """Returns the parameters from which the compiled simulation draws the delays.
 
-        For the mean m and the standard deviation s, the logarithm of the delay is normal with
-        the variance sigma^2 = ln(1 + s^2 / m^2) and the mean mu = ln m - sigma^2 / 2.
+        For mean m and standard deviation s, the logarithm of the delay is normal with variance
+        sigma^2 = ln(1 + s^2 / m^2) and mean mu = ln m - sigma^2 / 2.
         """
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
@@ -193,9 +190,9 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
-    """Fixed delay plus a random part from one of two exponential distributions.
+    """Fixed delay plus a random part drawn from one of two exponential distributions.
 
-    Mobile networks have such delays: most messages are fast, and some wait much longer.
+    Typical of mobile networks, where most messages are fast but some wait much longer.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
@@ -223,8 +220,8 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
         """Returns the mean and the standard deviation of the delay, in ms.
 
         The delay is a fixed part plus a mixture of two exponential distributions. The second
-        moment of a mixture is the mixture of the second moments. Exponential distributions with
-        the means a and b have the second moments 2 a^2 and 2 b^2.
+        moment of a mixture is the mixture of the second moments, which are 2 a^2 and 2 b^2 for
+        exponential distributions with means a and b.
         """
         fast = self.fast_ms
         slow = self.slow_ms
@@ -235,14 +232,14 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Delay that changes slowly: if one message is slow, the next message is probably slow too.
+    """Delay that varies slowly: a slow message is likely to be followed by another slow one.
 
-    The delays are normally distributed and correlated from message to message. Negative delays
-    become zero.
+    Delays are normally distributed and correlated between messages. Negative delays are set to
+    zero.
 
     Attributes:
         correlation: Correlation between the delays of two consecutive samples, before negative
-            delays become zero.
+            delays are set to zero.
     """
 
     correlation: Correlation
@@ -252,9 +249,9 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
         return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and standard deviation of the delay max(0, x) for a normal x, ms.
+        """Returns the mean and standard deviation of the delay max(0, x) for normal x, in ms.
 
-        The variance is written as a sum in which large terms do not cancel each other.
+        The variance is written as a sum that avoids cancellation of large terms.
         """
         m = self.delay_ms
         s = self.deviation_ms
@@ -269,36 +266,36 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """Ideal network link, which delays and loses nothing.
+    """Ideal network link with no delay and no loss.
 
-    The receiver still uses a message from its next control period on, because a message cannot
-    act in the period in which it was sent.
+    The receiver uses a message from its next control period on, since a message cannot act in
+    the period in which it was sent.
     """
 
     @property
     def constant_delay_ms(self) -> float:
-        """Delay of every message, in ms: none."""
+        """Delay of every message, in ms: always 0."""
         return 0.0
 
     def _delay(self) -> LinkModel:
-        """Returns the settings of a link without delay, for the compiled simulation."""
+        """Returns the settings of a link with no delay, for the compiled simulation."""
         return LinkModel()
 
     def _moments(self) -> tuple[float, float]:
-        """Returns zero for the mean and for the standard deviation of the delay, in ms."""
+        """Returns a mean and a standard deviation of zero, in ms."""
         return 0.0, 0.0
 
     def _describe_delay(self) -> str:
-        """Returns the text that users read about a link without delay."""
+        """Returns the description of a link with no delay."""
         return "no delay"
 
 
 class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
-    """Network link that delays every message by the same time.
+    """Network link with the same delay for every message.
 
     Attributes:
-        delay_ms: Delay, in ms. A delay of 0 still means one period, because the receiver uses a
-            sample from its next tick on.
+        delay_ms: Delay, in ms. Even with a delay of 0, the receiver uses a sample only from its
+            next tick on, one period later.
     """
 
     delay_ms: Milliseconds
@@ -309,11 +306,11 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
         return self.delay_ms
 
     def _delay(self) -> LinkModel:
-        """Returns the delay in whole microseconds, for the compiled simulation."""
+        """Returns the delay as an integer in microseconds, for the compiled simulation."""
         return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the constant delay as the mean, and zero as the standard deviation, in ms."""
+        """Returns the constant delay as the mean, with a standard deviation of zero, in ms."""
         return self.delay_ms, 0.0
 
     def _describe_delay(self) -> str:
@@ -322,7 +319,7 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
 
 
 class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
-    """Network delay that rises and falls as a sine of the time t at which a message is sent.
+    """Delay that varies sinusoidally with the send time t of the message.
 
         T(t) = delay + amplitude sin(2 pi t / period + phase)
 
@@ -349,7 +346,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation over whole periods, in ms."""
+        """Returns the mean and the standard deviation over complete periods, in ms."""
         return self.delay_ms, self.amplitude_ms / math.sqrt(2.0)
 
     def _reach_ms(self) -> float:
@@ -357,23 +354,23 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         return self.delay_ms + self.amplitude_ms
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the amplitude exceeds the mean, as delays would be negative."""
+        """Returns a problem if the amplitude exceeds the mean, giving negative delays."""
         if self.amplitude_ms > self.delay_ms:
             return KeyProblem("amplitude_ms", f"must be at most delay_ms = {self.delay_ms:g}")
         return None
 
 
 class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
-    """Network delay that repeats a measurement: a table of sending times and delays.
+    """Delay replayed from a recorded trace of send times and delays.
 
-    An author names a file with the table. A resolved scenario contains the table itself, so
-    that the experiment can be repeated without the file.
+    A scenario names a file that contains the trace. A resolved scenario contains the trace
+    itself, so the experiment can be repeated without the file.
 
     Attributes:
-        trace: Points of the table as the text "t_us delay_us, t_us delay_us, ...". A lost
-            sample has "lost" in place of its delay.
-        at_end: What happens after the last point. "hold": The last delay is kept. "loop": The
-            table is repeated.
+        trace: The trace as a string "t_us delay_us, t_us delay_us, ...", with "lost" in place
+            of the delay of a lost sample.
+        at_end: What happens after the last point: "hold" to keep the last delay, or "loop" to
+            repeat the trace.
     """
 
     trace: str
@@ -381,21 +378,21 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
     @property
     def points(self) -> Points:
-        """Points of the table: send times and delays in microseconds, shape (n, 2)."""
+        """Send times and delays of the trace, in microseconds, shape (n, 2)."""
         return parse_trace(self.trace)
 
     def _delay(self) -> LinkModel:
         """Returns the settings of a recorded delay, for the compiled simulation.
 
-        The recorded points themselves are in a separate array, see `points`.
+        Excludes the recorded points, which are in a separate array (see `points`).
         """
         return LinkModel.follow_trace(self.at_end)
 
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and the standard deviation of the recorded delays, in ms.
 
-        The delay of each point of the table is weighted by the time until the next point, and
-        lost messages are left out. Both results are NaN if all messages were lost.
+        Each delay is weighted by the time until the next point, and lost messages are excluded.
+        Both results are NaN if all messages were lost.
         """
         t_us, delay_us = self.points.T
         # The last point lasts as long as the point before it.
@@ -411,11 +408,11 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return mean_us / 1e3, math.sqrt(variance) / 1e3
 
     def _reach_ms(self) -> float:
-        """Returns the longest delay in the recorded table, in ms."""
+        """Returns the longest delay in the trace, in ms."""
         return float(self.points[:, 1].max()) / 1e3
 
     def _find_delay_problem(self) -> KeyProblem | None:
-        """Returns a problem if the text of the recorded delays cannot be read as a table."""
+        """Returns a problem if the trace cannot be parsed."""
         try:
             parse_trace(self.trace)
         except ValueError as error:
@@ -424,10 +421,10 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """Network link of a live session to which the program adds no artificial delay.
+    """Network link of a live session with no artificial delay.
 
-    The receiver uses a message as soon as it has arrived over the real network. A simulation
-    cannot know these arrivals.
+    The receiver uses a message as soon as it arrives over the real network. These arrival times
+    cannot be simulated.
     """
 
     def _delay(self) -> LinkModel:
@@ -435,7 +432,7 @@ class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """Returns NaN twice, because the delay of the real network is not known in advance."""
+        """Returns NaN twice, since the delay of the real network is not known in advance."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:

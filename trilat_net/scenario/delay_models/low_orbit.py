@@ -1,8 +1,9 @@
-"""Models the delay of low-orbit satellite networks, which reassign paths at fixed intervals.
+"""Delay model of low-orbit satellite networks, which reassign paths at fixed intervals.
 
-All terminals get a new path through the satellites at the same time, for example every 15 s,
-and the delay jumps at this time. The delay of a message is therefore the sum of a fixed delay,
-a random part that is drawn once per interval, and a random part that is drawn for each message.
+All terminals switch to a new path through the satellites at the same time, for example every 15
+s, and the delay jumps at each switch. The delay of a message is therefore modelled as the sum
+of a fixed delay, a random part drawn once per interval, and a random part drawn for each
+message.
 """
 
 import math
@@ -15,18 +16,18 @@ from . import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
-    """Delay of a network of low-orbit satellites, such as Starlink.
+    """Delay of a low-orbit satellite network such as Starlink.
 
-    Such networks assign terminals to satellites again every 15 s, all terminals at once. Delay
-    and jitter change abruptly at these times: Mohan et al., "A Multifaceted Look at Starlink
-    Performance", WWW (2024). The model is the sum of a fixed delay, an exponential random part
-    that is drawn once per interval, and an exponential random part that is drawn for every
-    message.
+    These networks reassign terminals to satellites every 15 s, all terminals at once, and delay
+    and jitter change abruptly each time: Mohan et al., "A Multifaceted Look at Starlink
+    Performance", WWW (2024). The model is the sum of a fixed delay, an exponentially
+    distributed part drawn once per interval, and an exponentially distributed part drawn for
+    every message.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
-        path_ms: Mean of the part that is drawn once per interval, in ms.
-        jitter_ms: Mean of the part that is drawn for every sample, in ms.
+        path_ms: Mean of the part drawn once per interval, in ms.
+        jitter_ms: Mean of the part drawn for every sample, in ms.
         slot_s: Duration of an interval, in s.
     """
 
@@ -36,10 +37,10 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     slot_s: Annotated[float, Meta(gt=0.0, le=1e4)] = 15.0
 
     def draw(self, now: Any) -> None:
-        """Computes the delay of one message, and stores it in `now.drawn_us`, in microseconds.
+        """Computes the delay of one message and stores it in `now.drawn_us`, in microseconds.
 
-        It is the sum of the fixed part and two random parts. If x is uniform between 0 and 1,
-        then -log(x) has an exponential distribution with mean 1.
+        The delay is the sum of the fixed part and the two random parts. If x is uniformly
+        distributed between 0 and 1, then -log(x) is exponentially distributed with mean 1.
 
         Args:
             now: The sample, with its number and send time.
@@ -54,7 +55,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Returns the mean and the standard deviation of the delay, in ms, over many intervals.
+        """Returns the mean and the standard deviation of the delay over many intervals, in ms.
 
         An interval is the time, about 15 s, for which a terminal keeps its satellite. The
         variances of the two independent random parts add up.
@@ -65,7 +66,7 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     def _reach_ms(self) -> float:
         """Returns the longest delay that can be drawn, in ms.
 
-        The random parts are multiples of -log(x) with x of at least 2^-53, and -log(2^-53) =
+        The random parts are multiples of -log(x), where x is at least 2^-53 and -log(2^-53) =
         36.8.
         """
         return self.floor_ms + 36.8 * (self.path_ms + self.jitter_ms)

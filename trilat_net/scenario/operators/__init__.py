@@ -1,17 +1,17 @@
-"""Defines what all models of operators and environments have in common.
+"""Common base of all models of operators and environments.
 
-An operator is a human or a program that moves an arm. An environment is a wall or another body
-that acts on the arm. Each kind is one class in a file of this folder. There is no list of
-kinds: to add one, add a file. Its name in a scenario, the description of an experiment, is the
-tag of the class.
+An environment is a wall or another body that acts on the arm. Each kind is a class in its own
+file in this folder; adding a file adds a kind. The tag of the class is the name of the kind in
+a scenario.
 
-Kinds that the simulation kernel computes itself name a `TorqueKind`. Any other kind has its own
-two functions: `act`, which is compiled, and `effort`, which evaluates many rows at once.
+A kind that is built into the simulation kernel names its `TorqueKind`. Other kinds define two
+functions of their own: `act`, which is compiled, and `effort`, which evaluates many rows at
+once.
 
 Invariant:
-    - Torques and forces are those that act ON the arm. Times are seconds after the epoch, the
-      common start time. The name of a key ends in its unit.
-    - A wrong value is refused with the path of its key.
+    - Torques and forces act ON the arm. Times are in seconds after the epoch, the common start
+      time. The name of a key ends in its unit.
+    - An invalid value is rejected with the path of its key.
 """
 
 import math
@@ -37,17 +37,17 @@ from ..refusals import MAX_QUOTED_LENGTH
 
 
 class HeldArm(NamedTuple):
-    """Facts about an arm from which settings of its operators and environments follow.
+    """Properties of an arm that determine defaults of its operators and environments.
 
-    An operator moves the arm, and an environment is a body that the arm touches. For example,
-    the point to which an operator pulls the arm is initially the position of the arm.
+    For example, the target to which an operator pulls the arm is initially the position of the
+    arm.
 
     Attributes:
-        counts: Numbers of joints, task coordinates and parameters of the arm.
-        q0_rad: Start pose of the arm, in rad. It is not checked yet and may be invalid.
+        counts: Number of joints, task coordinates and parameters of the arm.
+        q0_rad: Start pose of the arm, in rad. Not validated yet.
         end_effector_m: Function that returns the position of the end effector in the start
             pose, in m.
-        draws: Object that replaces a random distribution in the settings by a drawn number.
+        draws: Draws the numbers for random distributions in the settings.
     """
 
     counts: VectorCounts
@@ -57,28 +57,28 @@ class HeldArm(NamedTuple):
 
 
 class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
-    """Base of all operators (models of persons) and environments, which push an arm.
+    """Base class of operators and environments, which apply torques or forces to an arm.
 
-    A subclass describes one kind by its keys in a scenario file, and converts them to numbers
-    for the compiled simulation. To add a kind, put a file with a subclass in this folder.
+    A subclass defines the scenario keys of one kind and converts them to the parameters used by
+    the compiled simulation. To add a kind, add a file with a subclass to this folder.
     """
 
     group: ClassVar[str] = "hands"
-    """List of a site to which the actor belongs: "hands" or "environment"."""
+    """Site list to which the actor belongs: "hands" or "environment"."""
     oscillates: ClassVar[bool] = False
-    """True if the torque is an oscillation in time, with which an arm never rests."""
+    """True if the torque oscillates in time, so that the arm never comes to rest."""
     value_texts: ClassVar[Mapping[str, str]] = {}
-    """Permitted values of each key that `VALUE_TEXTS` does not describe, for error messages."""
+    """Permitted values of keys missing from `VALUE_TEXTS`, for error messages."""
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment in the format of the compiled simulation."""
+        """Returns the operator or environment in the format read by the compiled simulation."""
         raise NotImplementedError
 
     @property
     def actor(self) -> TorqueSource:
-        """Numerical parameters of the operator or environment, which determine its torque.
+        """Numerical parameters from which the simulation computes the torque or force.
 
-        They are stored as numbers because compiled code cannot use Python objects.
+        Compiled code cannot use Python objects, so the parameters are stored as numbers.
         """
         return self._source()
 
@@ -86,27 +86,26 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Adds settings that the author of a scenario left out and that depend on the arm.
+        """Adds defaults that depend on the arm to the settings of an operator or environment.
 
-        For example, the start position of an operator is the position of the arm. A subclass
-        without settings of this kind does not override this method, which adds nothing.
+        For example, the default start position of an operator is the position of the arm.
+        Subclasses that have such settings override this method, which adds nothing by default.
 
         Args:
-            table: Settings of the operator or environment, completed with defaults. They are
-                changed.
-            entry: The same settings as the author wrote them.
-            held_arm: Arm on which the operator or environment acts.
+            table: Settings including all other defaults, modified in place.
+            entry: The same settings as written by their author.
+            held_arm: The arm on which the operator or environment acts.
             path: Path of the settings in the scenario, for error messages.
         """
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a contradiction between several keys of the table.
+        """Checks the keys of the table for contradictions between them.
 
-        The keys `normal`, `start_s` and `end_s` are checked here for all kinds that have them,
-        because they always mean the same.
+        Covers `normal`, `start_s` and `end_s` for every kind that has them, since these keys
+        mean the same in all of them.
 
         Returns:
-            The key and the reason. None if the keys agree with each other.
+            The key and the reason, or None if the keys are consistent.
         """
         normal = getattr(self, "normal", (1.0,))
         if math.hypot(*normal) < 1e-6:
@@ -121,11 +120,12 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
 
 class TimedActor(ActorBase, frozen=True, kw_only=True):
-    """Base of the operators and environments that act only between two times of a run.
+    """Base class of operators and environments that act only during an interval of the run.
 
     Attributes:
         start_s: Start of the interval, in s after the start of the run.
-        end_s: End of the interval, in s. By default, the action lasts until the end of the run.
+        end_s: End of the interval, in s after the start of the run. By default, the end of the
+            run.
     """
 
     start_s: fields.NotNegative = 0.0
@@ -133,51 +133,52 @@ class TimedActor(ActorBase, frozen=True, kw_only=True):
 
 
 class SampledActor(TimedActor, frozen=True, kw_only=True):
-    """Base of the operators and environments whose force may be held during a control period.
+    """Base class of operators and environments whose force may be sampled once per tick.
 
-    A force that is held is computed once per period, like that of a real device with a digital
-    controller. Otherwise it acts continuously.
+    A sampled force is held constant during a control period, like that of a real device with a
+    digital controller. Otherwise, the force acts continuously.
 
     Attributes:
         sampled: If True, the force is computed once per control period and held, as by a real
-            haptic device that renders a wall. If False, it is computed in every stage of the
-            numerical integration.
+            haptic device that renders a wall. If False, the force is computed in every stage of
+            the numerical integration.
     """
 
     sampled: bool = False
 
 
 class OwnActor(SampledActor, frozen=True, kw_only=True):
-    """Operator or environment whose torque is a function in a file of this folder.
+    """Base class of operators and environments whose torque is computed in Python.
 
-    A contributor adds a new kind by adding such a file. Its keys are numbers, or vectors with
-    one number per joint or axis. It acts on the joints. If `at_tip` is True, it acts on the end
-    effector: `act` and `effort` then receive the position and velocity of the end effector in m
-    and m/s, and return a force in N.
+    To add a kind, add a file with a subclass to this folder. The keys of the kind are numbers,
+    or vectors with one entry per joint or axis. By default, the torque acts on the joints. If
+    `at_tip` is True, a force acts on the end effector instead: `act` and `effort` receive the
+    position and velocity of the end effector in m and m/s, and return a force in N.
     """
 
     at_tip: ClassVar[bool] = False
 
     def act(self, now: Any) -> None:
-        """Computes the torque or force at one time, and stores it in `now.effort`.
+        """Computes the torque or force at one time and stores it in `now.effort`.
 
-        The method sets the entries i below `now.coordinates`. It is compiled, and is called
-        in every stage of the integrator. It may use `now.t_s`, `now.at` (angles or position)
-        and `now.speed`. The result must depend only on the keys and on `now`, and must have the
-        same bits on every machine. Therefore only functions of `core.elementary` and `sqrt` are
-        allowed.
+        An implementation sets the entries with index i below `now.coordinates`. It is compiled,
+        and called in every stage of the integrator. It may use `now.t_s`, `now.at` (angles or
+        position) and `now.speed`. The result must depend only on the keys and on `now`, and
+        must have the same bits on every machine, so the only permitted functions are those of
+        `core.elementary` and `sqrt`.
 
         Args:
-            now: Time and motion at which the torque is needed, and the field for the result.
+            now: Time and motion at which the torque is needed, and the field that receives the
+                result.
         """
         raise NotImplementedError
 
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:
-        """Computes the same torques or forces as `act`, for many times and motions at once.
+        """Computes the same torques or forces as `act` for many times and motions at once.
 
-        This method is written independently of `act`, and a test compares the two. The
-        linearisation of the control loop differentiates it by complex steps. Therefore it must
-        accept complex numbers, and its conditions must use the real parts.
+        This implementation is independent of `act`, and a test compares the two. The
+        linearisation of the control loop differentiates it by complex steps. Implementations
+        must therefore accept complex numbers and use real parts in conditions.
 
         Args:
             t_s: Times, in s.
@@ -190,9 +191,9 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
         raise NotImplementedError
 
     def _source(self) -> TorqueSource:
-        """Returns the operator or environment in the format of the compiled simulation.
+        """Returns the operator or environment in the format read by the compiled simulation.
 
-        The simulation calls its compiled method `act`.
+        The simulation calls its compiled `act` method.
         """
         kind = TorqueKind.OWN_TIP if self.at_tip else TorqueKind.OWN_JOINTS
         return TorqueSource(kind, self.start_s, self.end_s, sampled=self.sampled, model=self)
@@ -224,20 +225,20 @@ VALUE_TEXTS = {
     "acceleration_limit_m_s2": "an acceleration above 0 m/s^2",
     "acceleration_limit_rad_s2": "an acceleration above 0 rad/s^2",
 }
-"""Permitted values of each key, for error messages. `COUNT_TEXTS` fills the placeholders."""
+"""Permitted values of each key, for error messages, with placeholders for `COUNT_TEXTS`."""
 COUNT_TEXTS = {
     "joints": ("both joints or two", "all joints or one for each"),
     "axes": ("two numbers, x and y", "three numbers, x, y and z"),
     "all_axes": ("both axes or two", "all axes or three"),
     "each": ("joint 1, on joint 2", "each joint"),
 }
-"""Texts for the placeholders in `VALUE_TEXTS`: for the planar arm, and for any other arm."""
+"""Replacements for the placeholders in `VALUE_TEXTS`: for the planar arm, and for others."""
 
 
 _KINDS = {str(kind.__struct_config__.tag): kind for kind in ActorBase.find_kinds(__name__)}
 OPERATORS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "hands"}
 ENVIRONMENTS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "environment"}
-"""Classes of the operators and of the environments, by the name of the kind."""
+"""Mapping from kind to class, for operators and for environments."""
 if TYPE_CHECKING:
     Operator = ActorBase
     Environment = ActorBase
@@ -255,18 +256,17 @@ def resolve_operators(
 ) -> list[fields.TomlTable]:
     """Completes the settings of all operators, or of all environments, of one arm.
 
-    An operator moves the arm, and an environment is a body that the arm touches. Settings that
-    the author of the scenario left out get their defaults. Where the author stated a random
-    distribution, a number is drawn.
+    Missing settings are set to their defaults, and random distributions are replaced with drawn
+    numbers.
 
     Args:
-        written: List of the settings, one table for each operator, as the author wrote it.
-        kinds: Class of each permitted kind of operator, by name of the kind.
-        held_arm: Arm on which the operators act.
+        written: One table per operator or environment, as written by the author.
+        kinds: Mapping from the name of each permitted kind to its class.
+        held_arm: The arm on which the operators or environments act.
         path: Path of the list in the scenario, for error messages.
 
     Returns:
-        The completed tables, in the order of the list.
+        The completed tables, in the order of `written`.
 
     Raises:
         ScenarioError: A table is not valid.
@@ -289,7 +289,7 @@ def resolve_operators(
 def _find_kind(
     entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str
 ) -> type[ActorBase]:
-    """Returns the class for the kind of operator or environment that a table names.
+    """Returns the class for the kind of operator or environment named in a table.
 
     Raises:
         ScenarioError: The key is missing or wrong, or the kind belongs to the other list.
@@ -309,12 +309,12 @@ def _find_kind(
 
 
 class _RefusedKey(NamedTuple):
-    """Key of an operator's or environment's table whose value is missing or not valid.
+    """Key of an operator or environment table whose value is missing or invalid.
 
     Attributes:
         key: The key.
-        indices: Indices of the wrong entry in a list, such as "[3][1]". Empty if the whole
-            value is wrong.
+        indices: Indices of the invalid list entry, such as "[3][1]". Empty if the value as a
+            whole is invalid.
         is_missing: True if the key is missing.
     """
 
@@ -330,14 +330,14 @@ def _check_values(
     path: str,
     counts: VectorCounts,
 ) -> None:
-    """Refuses the table of an operator or environment with a value of a wrong type or length.
+    """Raises ScenarioError if a value of an operator or environment table is invalid.
 
-    The error says what its author may write instead.
+    The error states what its author may write instead.
 
     Args:
         table: Complete table.
         kind: Class of the table.
-        entry: Table as its author wrote it.
+        entry: Table as written by its author.
         path: Path of the table, for error messages.
         counts: Lengths of the arm's vectors.
     """
@@ -361,14 +361,14 @@ def _check_values(
 
 
 def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: VectorCounts) -> str:
-    """Returns the permitted values of a refused key, as text for the author of the scenario.
+    """Describes the permitted values of a rejected key to the author of the scenario.
 
     An example is "one torque for both joints or two, ON the arm, N m".
 
     Args:
         refused: The key.
         kind: Class of the table.
-        counts: Lengths of the arm's vectors, which determine words such as "both joints".
+        counts: Lengths of the arm's vectors, which affect wording such as "both joints".
     """
     text = kind.value_texts.get(refused.key) or VALUE_TEXTS[refused.key]
     if refused.key == "points" and refused.indices:
@@ -384,9 +384,9 @@ def _describe_values(refused: _RefusedKey, kind: type[ActorBase], counts: Vector
 def _find_refused_key(
     table: fields.TomlTable, kind: type[ActorBase], counts: VectorCounts
 ) -> _RefusedKey | None:
-    """Returns the first key of an operator's table whose value is missing or not valid.
+    """Returns the first key of a complete operator table with a missing or invalid value.
 
-    The table must be complete. The result is None if the table is valid.
+    Returns None if the table is valid.
     """
     try:
         msgspec.convert(table, kind)

@@ -1,9 +1,9 @@
-"""Models a soft body, such as tissue, into which the end effector of an arm presses.
+"""Models contact between the end effector of an arm and a soft body, such as tissue.
 
-The contact force has an elastic part, which grows with the depth, and a damping part, which
-grows with the depth and with the speed of pressing (the model of Hunt and Crossley, 1975).
-Therefore the force begins and ends at zero. A spring with a constant damper would make the
-force jump at contact.
+The contact force consists of an elastic part that grows with depth and a damping part that
+grows with depth and with the speed of pressing (Hunt and Crossley, 1975). The force is
+therefore zero at the start and end of contact, whereas a spring with a constant damper would
+make it jump at contact.
 """
 
 import math
@@ -18,22 +18,22 @@ from . import OwnActor
 
 
 class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
-    """Compliant body, such as tissue or rubber, with a damping that grows with the depth.
+    """Compliant body, such as tissue or rubber, whose damping grows with depth.
 
-        F = K d^(3/2) (1 + lambda d') along the normal of the surface, and never pulling
+        F = K d^(3/2) (1 + lambda d') along the surface normal, never pulling
 
-    d is the depth and d' its rate of change. The elastic part is the contact of a sphere after
-    Hertz. The damping is that of Hunt and Crossley, "Coefficient of restitution interpreted as
-    damping in vibroimpact", J. Applied Mechanics 42 (1975). With this damping, the force begins
-    and ends at zero. The force of a linear spring and damper would jump at contact and pull at
-    release. The body is passive, because its damping dissipates energy at every depth.
+    d is the depth and d' its rate of change. The elastic part is Hertzian contact with a
+    sphere. The damping term is from Hunt and Crossley, "Coefficient of restitution interpreted
+    as damping in vibroimpact", J. Applied Mechanics 42 (1975). It makes the force start and end
+    at zero, whereas the force of a linear spring and damper jumps at contact and pulls at
+    release. The body is passive, since the damping dissipates energy at every depth.
 
     Attributes:
-        point_m: A point of the surface, in m.
-        normal: Direction of the free side. Its length does not matter.
+        point_m: A point on the surface, in m.
+        normal: Surface normal, pointing away from the body. Need not be normalised.
         stiffness_n_m15: K, in N/m^1.5.
-        damping_s_m: lambda, in s/m: 3/2 of the rate at which the coefficient of restitution
-            falls with the speed of impact.
+        damping_s_m: lambda, in s/m: 3/2 times the rate at which the coefficient of restitution
+            decreases with impact speed.
     """
 
     group: ClassVar[str] = "environment"
@@ -49,12 +49,12 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
     damping_s_m: fields.NotNegative = 0.0
 
     def act(self, now: Any) -> None:
-        """Computes the force of the body on the end effector in N, and stores it in `now`.
+        """Computes the contact force on the end effector, in N, and stores it in `now`.
 
-        Nothing is stored while the end effector is outside of the body.
+        Stores nothing while the end effector is outside the body.
 
         Args:
-            now: Position and speed of the end effector. Its field `effort` receives the force.
+            now: Position and speed of the end effector. The field `effort` receives the force.
         """
         normal_squared = 0.0
         depth = 0.0
@@ -80,18 +80,18 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     # The force does not depend on the time.
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:  # noqa: ARG002
-        """Computes the contact force of a compliant body on the end effector, in N.
+        """Computes the contact force on the end effector, in N.
 
-        It is the formula of `act` for many positions at once.
+        Uses the same formula as `act`, but evaluates it at many positions at once.
 
         Args:
-            t_s: Times, in s. The force does not depend on them.
+            t_s: Times, in s. Not used, since the force does not depend on time.
             position: Positions of the end effector, in m, shape (..., n), where n is the number
                 of coordinates. Leading dimensions are independent cases.
             speed: Velocities of the end effector, in m/s, shape (..., n).
 
         Returns:
-            Forces in N, shape (..., n). Zero while the end effector is outside of the body.
+            Forces in N, shape (..., n). Zero while the end effector is outside the body.
         """
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         depth = (np.array(self.point_m) - position) @ normal

@@ -1,15 +1,12 @@
-"""Defines the operators and environments that the compiled simulation computes itself.
+"""Operators and environments that are built into the compiled simulation.
 
-An operator is a human or a program that moves an arm. An environment is a wall or another body
-that the arm touches. Each class stores the settings of one kind, such as a spring towards a
-moving target, a recorded torque or a wall. It converts them to a `TorqueSource`, a record from
-which the compiled simulation computes the torque on the arm. The `TorqueKind` in this record
-selects the formula, and the documentation of `TorqueSource` states the meaning of its numbers
-for each kind.
+Each class holds the settings of one kind, such as a spring towards a moving target, a recorded
+torque or a wall. It converts them to a `TorqueSource`, the record from which the compiled
+simulation computes the torque on the arm. The `TorqueKind` in this record selects the formula;
+see `TorqueSource` for the meaning of its parameters for each kind.
 
 Invariant:
-    - If the author of an experiment states no start for an operator, the operator holds the arm
-      at its start pose. The run therefore starts without a jump.
+    - By default, an operator holds the arm at its start pose, so the run starts without a jump.
 """
 
 import math
@@ -38,16 +35,16 @@ FARTHEST = 100.0
 STRONGEST = 10.0
 """Largest force that a program may request, as a multiple of the operator's force limit.
 
-A force above the limit is reduced to the limit. A force above this multiple is refused as a
+A force above the limit is clipped to the limit. A force above this multiple is rejected as a
 mistake.
 """
 DIRECTIONS = {
     "right": (1.0, 0.0, 0.0), "left": (-1.0, 0.0, 0.0), "ahead": (0.0, 1.0, 0.0),
     "back": (0.0, -1.0, 0.0), "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
 }  # fmt: skip
-"""Directions as seen by the person who holds a device: x to the right, y ahead, z up."""
+"""Directions as seen by the person who holds a device: x right, y ahead, z up."""
 FRAMES = {2: ("right", "up"), 3: ("ahead", "left", "up")}
-"""Default directions of an arm's axes, by the number of axes."""
+"""Mapping from the number of an arm's axes to their default directions."""
 _AXES_TEXTS = {
     "stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
     "damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
@@ -55,17 +52,16 @@ _AXES_TEXTS = {
 
 
 class Pulse(ActorBase, frozen=True, tag="pulse"):
-    """Operator who pushes the arm once, with a torque that rises and falls smoothly.
+    """Operator who pushes the arm once with a smooth torque pulse.
 
         torque = peak sin^2(pi (t - start) / (end - start))
 
-    t is the time from the start of the run. Before the start and after the end, the torque is
-    zero.
+    t is the time since the start of the run. The torque is zero outside the pulse.
 
     Attributes:
-        start_s: Start of the push, in s.
-        end_s: End of the push, in s.
-        peak_nm: Largest torque on each joint, in N m.
+        start_s: Start of the pulse, in s.
+        end_s: End of the pulse, in s.
+        peak_nm: Peak torque on each joint, in N m.
     """
 
     start_s: fields.NotNegative
@@ -73,20 +69,20 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
     peak_nm: fields.Joints
 
     def _source(self) -> TorqueSource:
-        """Returns the pulse of torque in the format of the compiled simulation."""
+        """Returns the torque pulse in the format read by the compiled simulation."""
         return TorqueSource(TorqueKind.PULSE, self.start_s, self.end_s, a=self.peak_nm)
 
 
 class MovingSpring(ActorBase, frozen=True, kw_only=True):
-    """Base of operators who pull the arm with a spring and a damper towards a moving target.
+    """Base class of operators who pull the arm towards a moving target.
 
-    The target moves from a start to an end along a smooth path, with minimum jerk. The first
-    four fields of a subclass are, in this order: the end of the path; its start, by default the
-    start of the arm; the stiffness; the damping.
+    The operator acts through a spring and a damper. The target moves along a minimum-jerk path.
+    The first four fields of a subclass must be the end of the path, its start (by default the
+    start of the arm), the stiffness and the damping, in this order.
 
     Attributes:
         move_start_s: Time at which the target starts to move, in s.
-        move_end_s: Time at which it reaches the end of the path, in s.
+        move_end_s: Time at which the target reaches the end of the path, in s.
         start_s: Time at which the operator takes hold of the arm, in s.
         end_s: Time at which the operator lets go of the arm, in s.
         sampled: If True, the torque is computed once per tick and held.
@@ -110,16 +106,14 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         held_arm: HeldArm,
         path: str,
     ) -> None:
-        """Adds the start and end of the operator's motion, if the author left them out.
+        """Adds the default start and end of the target's path.
 
-        The operator pulls the arm to a moving target. By default, the target starts where the
-        arm starts, and stays there.
+        By default, the target starts at the start pose of the arm and does not move.
 
         Args:
-            table: Settings of the operator, completed with other defaults. They are changed.
-            entry: The same settings as the author of the scenario wrote them. They are not
-                used.
-            held_arm: Arm that the operator moves.
+            table: Settings of the operator including all other defaults, modified in place.
+            entry: The same settings as written by their author. Not used.
+            held_arm: The arm that the operator moves.
             path: Path of the settings in the scenario, for error messages.
         """
         end_key, start_key = field_names(cls)[:2]
@@ -128,12 +122,12 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         held_arm.draws.follow_start(table, end_key, table[start_key], path)
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Checks that the target of the operator does not arrive before it starts to move.
+        """Checks that the target does not arrive before it starts to move.
 
-        The checks of the base class are included.
+        Also performs the checks of the base class.
 
         Returns:
-            The wrong setting and the reason. None if there is no problem.
+            The key and the reason, or None if there is no problem.
         """
         problem = super().find_problem()
         if problem is not None or self.move_end_s >= self.move_start_s:
@@ -145,7 +139,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the spring and its moving target in the format of the compiled simulation."""
+        """Returns the spring and its moving target in the format read by the simulation."""
         end_target, start_target, stiffness, damping = msgspec.structs.astuple(self)[:4]
         return TorqueSource(
             TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND,
@@ -164,13 +158,13 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
 class JointSpring(MovingSpring, frozen=True, tag="spring"):
     """Operator who pulls every joint with a spring and a damper towards a moving pose.
 
-    It is the model of a person who moves an arm to a pose and feels its resistance.
+    Models a person who moves an arm to a pose and feels its resistance.
 
     Attributes:
-        to_rad: Pose at the end of the motion of the target, in rad.
-        from_rad: Pose before the motion, in rad. By default, the start pose of the arm.
-        stiffness_nm_rad: Stiffness for each joint, in N m/rad.
-        damping_nm_s_rad: Damping for each joint, in N m s/rad.
+        to_rad: Final pose of the target, in rad.
+        from_rad: Initial pose of the target, in rad. By default, the start pose of the arm.
+        stiffness_nm_rad: Stiffness at each joint, in N m/rad.
+        damping_nm_s_rad: Damping at each joint, in N m s/rad.
     """
 
     at_tip: ClassVar[bool] = False
@@ -182,14 +176,13 @@ class JointSpring(MovingSpring, frozen=True, tag="spring"):
 
 
 class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
-    """Operator who pulls the end effector with a spring and a damper towards a moving point.
+    """Operator who pulls the end effector with a spring and damper towards a moving point.
 
-    It is the model of a person who holds the end of an arm. The joints are free to arrange
-    themselves.
+    Models a person who holds the end of an arm and leaves its joints free.
 
     Attributes:
-        to_m: Point at the end of the motion of the target, in m, one number per axis.
-        from_m: Point before the motion, in m. By default, the start position of the end
+        to_m: Final position of the target, in m, one coordinate per axis.
+        from_m: Initial position of the target, in m. By default, the start position of the end
             effector.
         stiffness_n_m: Stiffness along each axis, in N/m.
         damping_n_s_m: Damping along each axis, in N s/m.
@@ -205,44 +198,43 @@ class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
 
 
 class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
-    """Operator whose torque over time was recorded as a table, and is repeated.
+    """Operator who replays a torque that was recorded over time.
 
-    The torque is interpolated linearly between the points of the table. It is zero before the
-    first and after the last point.
+    The torque is interpolated linearly between the recorded points. It is zero before the first
+    point and after the last.
 
     Attributes:
-        points: Rows with the time in s and the torque on each joint in N m, in the order of
-            time.
+        points: Rows in ascending order of time, each with the time in s and the torque on each
+            joint in N m.
     """
 
     points: Annotated[tuple[RecordedPoint, ...], Meta(min_length=1, max_length=1_000_000)]
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Checks that the times in a table of recorded torques are in ascending order.
+        """Checks that the times of the recorded torque are in ascending order.
 
-        The simulation finds the torque of a time by bisection, which needs this order.
+        The simulation looks up the torque by bisection, which requires sorted times.
 
         Returns:
-            The setting `points` and the reason. None if every time is later than the previous
-            time.
+            The key `points` and the reason, or None if the times are strictly increasing.
         """
         if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")
         return None
 
     def _source(self) -> TorqueSource:
-        """Returns the recorded torques in the format of the compiled simulation."""
+        """Returns the recorded torques in the format read by the compiled simulation."""
         return TorqueSource(TorqueKind.RECORDED, table=np.array(self.points, dtype=np.float64))
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """Operator whose torque is a sine of changing frequency, for example to measure a response.
+    """Operator whose torque is a sine of varying frequency, used to measure responses.
 
-    The frequency changes linearly from its first to its last value, for example from 0.1 to 10
-    Hz. This sweep is repeated.
+    The frequency sweeps linearly from its first to its last value, for example from 0.1 to 10
+    Hz, and the sweep is repeated.
 
     Attributes:
-        peak_nm: Amplitude on each joint, in N m.
+        peak_nm: Torque amplitude on each joint, in N m.
         from_hz: Frequency at the beginning of a sweep, in Hz.
         to_hz: Frequency at the end of a sweep, in Hz.
         sweep_s: Duration of a sweep, in s.
@@ -256,7 +248,7 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     sweep_s: fields.Positive
 
     def _source(self) -> TorqueSource:
-        """Returns the sine of changing frequency in the format of the compiled simulation."""
+        """Returns the frequency sweep in the format read by the compiled simulation."""
         return TorqueSource(
             TorqueKind.CHIRP,
             start_s=self.start_s,
@@ -269,16 +261,16 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
 
 
 class Multisine(TimedActor, frozen=True, tag="multisine"):
-    """Operator whose torque is a sum of sines with equal amplitude, to excite an arm.
+    """Operator whose torque is a sum of sines of equal amplitude.
 
-    Such a torque excites several frequencies at once, so that the response of the arm at each
-    frequency can be measured in one run.
+    Excites several frequencies at once, so the frequency response of the arm can be measured in
+    a single run.
 
     Attributes:
         amplitude_nm: Amplitude of each sine on each joint, in N m.
         frequencies_hz: Frequencies of the sines, in Hz.
-        phases_rad: Phases of the sines at the start, in rad. By default, -pi k (k - 1) / n for
-            the k-th of n sines, which keeps the peak of the sum low (Schroeder, "Synthesis of
+        phases_rad: Initial phases of the sines, in rad. By default, -pi k (k - 1) / n for the
+            k-th of n sines, which keeps the peak of the sum low (Schroeder, "Synthesis of
             low-peak-factor signals and binary sequences with low autocorrelation", IEEE Trans.
             Information Theory 16 (1970)).
     """
@@ -290,10 +282,10 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     phases_rad: Annotated[tuple[fields.Real, ...], Meta(max_length=64)] = ()
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Checks that each sine has a phase, and that the end is not before the start.
+        """Checks that there is one phase per sine, and that the end is not before the start.
 
         Returns:
-            The wrong setting and the reason. None if there is no problem.
+            The key and the reason, or None if there is no problem.
         """
         count = len(self.frequencies_hz)
         if len(self.phases_rad) not in (0, count):
@@ -303,9 +295,9 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         return super().find_problem()
 
     def _source(self) -> TorqueSource:
-        """Returns the sines in the format that the compiled simulation reads.
+        """Returns the sines in the format read by the compiled simulation.
 
-        Each sine is a row of its frequency in Hz and its phase in turns.
+        Each sine is a row with its frequency in Hz and its phase in turns.
         """
         count = len(self.frequencies_hz)
         turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
@@ -319,22 +311,22 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
 
 
 class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
-    """Settings of a haptic device or controller with which a person moves an arm.
+    """Settings of a haptic device or controller used to move an arm.
 
-    A spring pulls the end effector of the arm to a target, and the device moves the target.
+    The device moves a target, to which a spring pulls the end effector of the arm.
 
     Attributes:
-        frame: Direction of each axis of the arm as the person sees it: "right", "left",
-            "ahead", "back", "up" or "down". By default, right and up in the plane, and ahead,
-            left and up in space.
+        frame: Direction of each axis of the arm as seen by the person: "right", "left",
+            "ahead", "back", "up" or "down". By default, right and up for a planar arm, and
+            ahead, left and up for a chain.
         scale: Ratio of the motion of the target to the motion of the device.
-        clutch: Button that couples device and arm while it is pressed. The first press takes
+        clutch: Button that couples the device to the arm while pressed. The first press takes
             hold of the arm.
         release: Button that lets go of the arm.
         force_scale: Ratio of the force on the device to the force of the arm on its operator.
         force_limit_n: Largest force on the device, in N.
-        jump_m_s: Speed of the device above which its motion counts as a jump of the
-            measurement, in m/s. A jump does not move the target.
+        jump_m_s: Speed of the device above which its motion is treated as a measurement error,
+            in m/s. Such a jump does not move the target.
     """
 
     frame: Annotated[tuple[str, ...], Meta(max_length=3)] = ()
@@ -346,14 +338,11 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     jump_m_s: fields.Positive = 5.0
 
     def rows(self, axes: int) -> list[tuple[float, ...]]:
-        """Returns how the axes of an arm correspond to the axes of a haptic device.
-
-        The result has, for each axis of the arm, the direction in which the user of the device
-        sees it.
+        """Returns the direction of each axis of the arm as seen by the user of the device.
 
         Args:
-            axes: Number of axes of the arm: 2 for a planar arm, 3 in space. If the settings
-                state no directions, this number selects the default directions.
+            axes: Number of axes of the arm: 2 for a planar arm, 3 for a chain. Selects the
+                default directions if the settings specify none.
 
         Returns:
             One unit vector per axis of the arm, in the coordinates of the user.
@@ -364,18 +353,18 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """Operator who takes hold of the arm during a live session.
 
-    The operator is a person with a mouse or a haptic device, or a program. Until the operator
-    takes hold, nobody holds the arm. In virtual time, nobody holds the arm, except in a rerun
-    of a log in which somebody held it.
+    The operator is a person with a mouse or a haptic device, or a program. Nobody holds the arm
+    until the operator takes hold of it. In virtual time, nobody ever does, except in a rerun of
+    a log in which somebody held the arm.
 
-    The force is computed once per tick and then constant until the next tick. In the mode
-    "force", the operator commands the force itself. The work of such a force has an error of
-    first order in the tick period, because only the arm resists the force.
+    The force is computed once per tick and held until the next one. In the mode "force", the
+    operator commands the force directly. The work done by such a force has a first-order error
+    in the tick period, since nothing but the arm resists the force.
 
     Attributes:
-        mode: "tip": A spring pulls the end effector towards a target that the operator moves.
-            "joint": A spring at every joint pulls towards a target pose. "force": The operator
-            commands a force at the end effector.
+        mode: "tip" if a spring pulls the end effector towards a target that the operator moves,
+            "joint" if a spring at every joint pulls towards a target pose, or "force" if the
+            operator commands a force at the end effector.
         stiffness_n_m: For "tip": stiffness along each axis, in N/m.
         damping_n_s_m: For "tip": damping along each axis, in N s/m.
         force_limit_n: For "tip" and "force": largest force, in N.
@@ -414,21 +403,20 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Checks the settings of a live operator, and removes defaults that have no effect.
+        """Validates the settings of a live operator and removes defaults of unused modes.
 
-        A live operator moves the arm by hand during the run. In the mode "tip" the operator
-        moves the end effector, in "joint" the joints, and in "force" a force is applied. Each
-        mode has its own settings. The defaults of the other modes are removed.
+        Each of the modes "tip", "joint" and "force" has settings of its own. Defaults of the
+        other modes are removed, since they have no effect.
 
         Args:
-            table: Settings of the operator, completed with defaults. They are changed.
-            entry: The same settings as the author of the scenario wrote them.
-            held_arm: Arm that the operator moves.
+            table: Settings of the operator including defaults, modified in place.
+            entry: The same settings as written by their author.
+            held_arm: The arm that the operator moves.
             path: Path of the settings in the scenario, for error messages.
 
         Raises:
-            ScenarioError: The author wrote a setting of another mode, or a wrong direction of
-                an axis.
+            ScenarioError: The author specified a setting of another mode, or an invalid axis
+                direction.
         """
         mode = entry.get("mode", "tip")
         check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
@@ -451,14 +439,14 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def make_rules(
         self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
     ) -> HandRules:
-        """Returns the limits on what a person may command while moving an arm during a run.
+        """Returns the limits on what an operator may command while moving the arm.
 
-        They bound the speed and range of the point to which the arm is pulled, and the forces.
+        They bound the speed and range of the target to which the arm is pulled, and the forces.
 
         Args:
             rate_hz: Tick rate of the site, in Hz.
             arm: Model of the arm that the operator moves.
-            limits: Limits of the motion of the site. None if there are no limits.
+            limits: Motion limits of the site. None if there are no limits.
         """
         if self.mode == "force":
             return HandRules(
@@ -490,9 +478,9 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         )
 
     def _source(self) -> TorqueSource:
-        """Returns the spring and limits of a person who moves the arm, for the simulation.
+        """Returns the spring and limits of a live operator, for the compiled simulation.
 
-        The point to which the arm is pulled is not included, because it changes during the run.
+        The target to which the arm is pulled is not included, since it changes during the run.
         """
         stiffness = self.stiffness_n_m
         damping = self.damping_n_s_m
@@ -506,10 +494,9 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
 
 def _check_frame(frame: list[Any], axes: int, path: str) -> None:
-    """Refuses directions for the axes of a device that are not a valid choice.
+    """Raises ScenarioError if the axis directions of a device are not a valid choice.
 
-    The author of a scenario states how the axes of a haptic device correspond to those of the
-    arm. Unknown, missing, superfluous or parallel axes are refused.
+    Unknown, missing, superfluous or parallel directions are rejected.
 
     Args:
         frame: Names of the directions, one per axis.
@@ -545,16 +532,16 @@ LIVE_KEYS = {
     ),
     "force": ("force_limit_n",),
 }
-"""Keys of a live operator, by the mode."""
+"""Mapping from mode to the keys of a live operator."""
 
 
 class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
-    """Environment that resists the motion of the joints, like a viscous liquid.
+    """Environment that resists joint motion like a viscous liquid.
 
-    The torque on a joint is the negative of its damping times its speed.
+    The torque on a joint is minus its damping times its speed.
 
     Attributes:
-        damping_nm_s_rad: Damping for each joint, in N m s/rad.
+        damping_nm_s_rad: Damping at each joint, in N m s/rad.
     """
 
     group: ClassVar[str] = "environment"
@@ -562,7 +549,7 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
     damping_nm_s_rad: fields.NotNegativeJoints
 
     def _source(self) -> TorqueSource:
-        """Returns the damping of the joints in the format of the compiled simulation."""
+        """Returns the joint damping in the format read by the compiled simulation."""
         return TorqueSource(
             TorqueKind.VISCOUS,
             self.start_s,
@@ -573,14 +560,13 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
 
 
 class Wall(SampledActor, frozen=True, tag="wall"):
-    """Flat wall that pushes the end effector out along its normal, and never pulls.
+    """Flat wall that pushes the end effector out along the wall normal and never pulls.
 
-    The force is that of a spring and a damper. It is zero while the end effector does not touch
-    the wall.
+    The force is that of a spring and a damper, and is zero without contact.
 
     Attributes:
-        point_m: A point of the surface, in m, one number per axis.
-        normal: Direction of the free side. Its length does not matter.
+        point_m: A point on the surface, in m, one coordinate per axis.
+        normal: Surface normal, pointing to the free side. Need not be normalised.
         stiffness_n_m: Stiffness, in N/m.
         damping_n_s_m: Damping, in N s/m.
     """
@@ -597,7 +583,7 @@ class Wall(SampledActor, frozen=True, tag="wall"):
     damping_n_s_m: fields.NotNegative = 0.0
 
     def _source(self) -> TorqueSource:
-        """Returns the wall as the compiled simulation reads it, with a normal of length 1."""
+        """Returns the wall, with a unit normal, in the format read by the simulation."""
         x, y, z = (*self.normal, 0.0)[:3]
         # `math.hypot` of three numbers, unlike that of two, is rounded differently on different
         # machines.

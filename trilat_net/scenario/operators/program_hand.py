@@ -1,16 +1,16 @@
-"""Lets a user's program act as the operator of an arm, for example a learned policy.
+"""Lets a user's program, for example a learned policy, act as the operator of an arm.
 
-The author of an experiment names the class of the program in the scenario:
+The scenario names the class of the program:
 
     { kind = "own", class = "my_policy:Reach" }
 
-`ProgramHand` stores this table, and `HandPlayer` calls the program at a fixed rate during the
-run. The actions of the program take effect in control periods of the arm.
+`ProgramHand` holds this table, and `HandPlayer` calls the program at a fixed rate during the
+run. The actions of the program take effect at control periods of the arm.
 
 Invariant:
-    - Naming the class does not run any of its code.
-    - If the program fails, it lets go of the arm at that tick, and is not called again. The run
-      continues, and nothing else at this site or at other sites is affected.
+    - Naming the class in a scenario does not run any of its code.
+    - If the program fails, it lets go of the arm at that tick and is not called again. The run
+      continues, and nothing else at this site or any other site is affected.
 """
 
 import math
@@ -54,30 +54,30 @@ POLICY = "policy"
 """Name under which a trained program takes hold of an arm in the log."""
 
 FAILED_HAND = "failed at tick"
-"""Words in the events of a log for a program that failed while it moved an arm."""
+"""Phrase used in log events for a program that failed while moving an arm."""
 
 
 class ProgramHand(
     LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}
 ):
-    """Operator that is a program instead of a person: a user's class.
+    """Operator that is a user's program (a Python class) instead of a person.
 
-    The program receives what its site knows, and moves, turns or pushes the arm. It takes hold
-    of the arm at its first action, and nobody else can hold that arm. Otherwise the same rules
-    apply as for a live operator, see `LiveHand`.
+    The program observes what its site knows, and moves, turns or pushes the arm. It takes hold
+    of the arm with its first action, and nobody else can hold that arm. Otherwise, the rules
+    are those of a live operator (see `LiveHand`).
 
     Attributes:
         code: Class of the program, for example "my_policy:Reach".
-        rate_hz: Rate at which the program is called, in Hz. It divides the tick rate of the
+        rate_hz: Rate at which the program is called, in Hz. Must divide the tick rate of the
             site.
-        delay_ms: Time from the observation to the resulting action, in ms. The program may take
-            this time for its computation.
-        process: If True, the program runs in a process of its own in a live session
-            (`trilat hand`). Otherwise it runs in the process of the site.
-        acceleration_limit_m_s2: As for a live operator, but without a limit by default.
-        acceleration_limit_rad_s2: As for a live operator, but without a limit by default.
-        source_sha256: SHA-256 hash of the file of the class.
-        settings: Arguments of the class, by name.
+        delay_ms: Time from an observation to the resulting action, in ms: the time available to
+            the program for its computation.
+        process: If True, the program runs in a separate process in a live session (`trilat
+            hand`). Otherwise, it runs in the process of the site.
+        acceleration_limit_m_s2: As for a live operator, but unlimited by default.
+        acceleration_limit_rad_s2: As for a live operator, but unlimited by default.
+        source_sha256: SHA-256 hash of the file that contains the class.
+        settings: Mapping from name to value of the constructor arguments of the class.
     """
 
     is_open: ClassVar[bool] = False
@@ -107,15 +107,14 @@ class ProgramHand(
     ) -> None:
         """Completes the settings of a program that operates an arm.
 
-        The user wrote the program as a Python class. The method adds the SHA-256 hash of the
-        file that contains the class. The hash identifies the version of the program with which
-        an experiment was made. Settings that the program has in common with a person who moves
-        the arm are completed as for a person.
+        Adds the SHA-256 hash of the file that contains the class, which records the version of
+        the program used in the experiment. Settings shared with live operators are completed in
+        the same way as theirs.
 
         Args:
-            table: Settings of the operator, completed with defaults. They are changed.
-            entry: The same settings as the author of the scenario wrote them.
-            held_arm: Arm that the program moves.
+            table: Settings of the operator including defaults, modified in place.
+            entry: The same settings as written by their author.
+            held_arm: The arm that the program moves.
             path: Path of the settings in the scenario, for error messages.
 
         Raises:
@@ -131,12 +130,10 @@ class ProgramHand(
 
 
 class HandSite(NamedTuple):
-    """Site, the process that runs one arm, whose arm is moved by a program.
-
-    The program is a user's Python class, which takes the place of a person.
+    """A site at which a program (a user's Python class) operates the arm.
 
     Attributes:
-        scenario: Description of the experiment.
+        scenario: The scenario.
         name: Name of the site.
         spec: Settings of the program in the scenario.
         rate_hz: Rate at which the program is called, in Hz.
@@ -153,34 +150,32 @@ class HandSite(NamedTuple):
     def program(self) -> str:
         """Name of the class that operates the arm, for example "my_policy:Reach".
 
-        If no class is named, it is "a program".
+        "a program" if no class is named.
         """
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
     def has_separate_process(self) -> bool:
-        """True if the program runs in a process of its own in a live session.
+        """True if the program runs in a separate process in a live session.
 
-        A slow program then does not delay the control loop. Otherwise the program runs in the
-        process of the site.
+        A slow program then does not delay the control loop of the site.
         """
         return isinstance(self.spec, ProgramHand) and self.spec.process
 
     @property
     def source(self) -> str:
-        """Text by which an arm's process recognises the messages of this program.
+        """Identifier by which a site recognises the messages of this program.
 
-        It consists of the class of the program and the hash of the experiment, for example
-        "my_policy:Reach 5cfbf3f16ec0c567". Both parts are shortened to fit into a message.
+        Combines the class of the program with the hash of the scenario, as in "my_policy:Reach
+        5cfbf3f16ec0c567". Both are shortened to fit into a message.
         """
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
     def describe(self) -> HandContext:
-        """Returns the facts about the experiment that the program receives when it is created.
+        """Returns the information that the program receives when it is created.
 
-        The program is a user's Python class that operates an arm. The facts include the name of
-        its site (the process of the arm), the other sites, and the mode in which it moves the
-        arm.
+        Includes the name of its site, the other sites, and the mode in which the program moves
+        the arm.
         """
         spec = self.spec
         rules = self.make_rules()
@@ -199,16 +194,16 @@ class HandSite(NamedTuple):
     def make_rules(self) -> HandRules:
         """Returns the limits on what the program that moves this arm may command.
 
-        They bound the speed and range of the point to which the arm is pulled, and the forces.
+        They bound the speed and range of the target to which the arm is pulled, and the forces.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         return self.spec.make_rules(tick_rate_hz, self.scenario.arms[self.name])
 
     def make_hand(self) -> OwnHand:
-        """Creates the object that calls the program and applies its actions at the right times.
+        """Creates the object that calls the program and applies its actions at the right ticks.
 
-        The program is called `rate_hz` times a second. An action takes effect `delay_s` after
-        the observation on which it is based, rounded up to a whole control period.
+        The program is called `rate_hz` times per second. An action takes effect `delay_s` after
+        the observation on which it is based, rounded up to a whole number of control periods.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
@@ -220,14 +215,14 @@ class HandSite(NamedTuple):
 
     @classmethod
     def find(cls, scenario: "Scenario", site: str) -> "HandSite | None":
-        """Finds the program that moves an arm in place of a person, if the arm has one.
+        """Returns the program that operates the arm of a site, if there is one.
 
         Args:
-            scenario: Description of the experiment.
+            scenario: The scenario.
             site: Name of the site.
 
         Returns:
-            The site with its program. None if no operator of the site is a program.
+            The site with its program, or None if no operator of the site is a program.
         """
         for hand in scenario.sites[site].hands:
             if isinstance(hand, ProgramHand):
@@ -241,14 +236,13 @@ class HandSite(NamedTuple):
         return None
 
     def make_program(self) -> HandProgram:
-        """Creates an object of the user's class that moves the arm of one site.
+        """Creates an instance of the user's class that operates the arm.
 
-        A site is the process that runs one arm. The class is imported here, if a person has
-        permitted it to run.
+        Imports the class, provided that a person has permitted its code to run.
 
         Raises:
             CodeWithheld: The class may not run.
-            ScenarioError: The class cannot be imported, or no instance of it can be created.
+            ScenarioError: The class cannot be imported or instantiated.
         """
         path = f"sites.{self.name}.hands"
         spec = self.spec
@@ -261,21 +255,20 @@ class HandSite(NamedTuple):
 
 
 class HandPlayer:
-    """Calls a program that operates an arm, and passes its actions to the site of the arm.
+    """Calls a program that operates an arm, and passes its actions to the site.
 
-    The program is a user's Python class, and the site is the process that runs the arm. If the
-    program fails, it no longer moves the arm for the rest of the run.
+    A program that fails does not move the arm for the rest of the run.
 
     Args:
         hand_site: The site, and the settings of the program.
-        program: The program, an instance of the user's class.
+        program: Instance of the user's class.
         watch: Function through which the program is called, for example with a time limit.
 
     Attributes:
         hand: Schedule that decides when the program is called and when its actions take effect.
-        failure: Reason why the program failed. Empty if it did not fail.
-        news: Changes that have not been published yet, for example that the program took hold
-            of the arm. Each change is the number of the control period and a sentence.
+        failure: Reason why the program failed. Empty if the program has not failed.
+        news: Events that have not been published yet, for example that the program took hold of
+            the arm. Each event is a pair of tick number and sentence.
     """
 
     def __init__(self, hand_site: HandSite, program: Any, watch: Watch = call_directly) -> None:
@@ -290,18 +283,40 @@ class HandPlayer:
         self._rate_hz = scenario.sites[hand_site.name].rate_hz
         self.hand = hand_site.make_hand()
 
-    def track(self, site: Site, k: int) -> list[float]:
-        """Returns the action of the program that operates the arm, in one control period.
-
-        The program is called if a call is due. Otherwise its earlier action continues. The
-        method must be called once for each control period, in order.
+    @staticmethod
+    def make_all(scenario: "Scenario") -> "dict[str, HandPlayer]":
+        """Creates the programs of all sites whose arm is operated by a program.
 
         Args:
-            site: The process of the arm, before the period.
+            scenario: The scenario.
+
+        Returns:
+            Mapping from site name to the object that calls the program. Empty if no site has a
+            program.
+
+        Raises:
+            CodeWithheld: Nobody has permitted the code of a class to run.
+            ScenarioError: A program cannot be created.
+        """
+        players = {}
+        for name in scenario.names:
+            hand_site = HandSite.find(scenario, name)
+            if hand_site is not None:
+                players[name] = HandPlayer(hand_site, hand_site.make_program())
+        return players
+
+    def track(self, site: Site, k: int) -> list[float]:
+        """Returns the action of the program in one control period.
+
+        Calls the program if a call is due; otherwise the previous action continues. Must be
+        called once per control period, in order.
+
+        Args:
+            site: State of the site before the control period.
             k: Number of the control period.
 
         Returns:
-            The action as the numbers of `HandInForce`: for example the target to which the
+            The action in the format of `HandInForce`, for example the target to which the
             program pulls the arm.
         """
         step = self.hand.advance_to(k, self._prepare(k, site.arrays))
@@ -309,18 +324,18 @@ class HandPlayer:
         return step.vector
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Computes the actions of the program that moves the arm, for several control periods.
+        """Computes the actions of the program for several control periods at once.
 
-        The result ends before the first period in which the program must observe a state of the
-        arm that has not been computed yet.
+        Stops before the first period in which the program has to observe a state of the arm
+        that has not been computed yet.
 
         Args:
             k: Number of the first control period.
-            end: Number of the first control period that is not included in any case.
-            arrays: State of the arm's process before period `k`.
+            end: Upper bound on the control period numbers, exclusive.
+            arrays: State of the site before period `k`.
 
         Returns:
-            One row per control period, with the numbers of `HandInForce`: for example the
+            One row per control period in the format of `HandInForce`, for example with the
             target to which the program pulls the arm.
         """
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
@@ -337,7 +352,7 @@ class HandPlayer:
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns the view of the program in control period k, such as the arms' states.
+        """Returns what the program observes in control period k, such as the arms' states.
 
         Args:
             k: Number of the tick.
@@ -346,10 +361,10 @@ class HandPlayer:
         return self.hand.build_view(k, arrays, self._layout)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Calls the program that moves the arm, and schedules the action that it returns.
+        """Calls the program and schedules the action that it returns.
 
-        The program receives what it observes in this control period. Its action takes effect
-        after the delay that its settings state.
+        The program receives its observation in this control period. Its action takes effect
+        after the delay configured for the program.
 
         Args:
             k: Number of the tick.
@@ -364,44 +379,19 @@ class HandPlayer:
             self.fail(k, describe_exception(error))
 
     def fail(self, k: int, problem: str) -> None:
-        """Makes the program let go of the arm for the rest of the run, because it failed.
+        """Makes a failed program let go of the arm for the rest of the run.
 
         The run continues without the program, and the reason is recorded.
 
         Args:
-            k: Number of the tick in which it lets go.
-            problem: Reason of the failure, as a string for the user.
+            k: Number of the tick in which the program lets go.
+            problem: Human-readable reason for the failure.
         """
         self.failure = f"{self._site}: its hand {self._code} {FAILED_HAND} {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
         self.hand.release(k)
 
     def _describe_change(self, k: int, change: str) -> str:
-        """Returns a sentence about the program, such as that it takes hold of the arm."""
+        """Returns a sentence about the program, for example that it takes hold of the arm."""
         t_s = tick_ns(k, self._rate_hz) / NS_PER_S
         return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
-
-
-def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
-    """Creates the programs that operate arms, for all sites that have a program.
-
-    A site is the process that runs one arm. Its operator can be a program, which is a user's
-    Python class, in place of a person.
-
-    Args:
-        scenario: Description of the experiment.
-
-    Returns:
-        For each site with a program, by name, the object that calls the program. Empty if no
-        site has a program.
-
-    Raises:
-        CodeWithheld: Nobody has permitted the code of a class to run.
-        ScenarioError: A program cannot be created.
-    """
-    players = {}
-    for name in scenario.names:
-        hand_site = HandSite.find(scenario, name)
-        if hand_site is not None:
-            players[name] = HandPlayer(hand_site, hand_site.make_program())
-    return players

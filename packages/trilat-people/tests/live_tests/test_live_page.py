@@ -36,7 +36,7 @@ from tests.live.processes import (
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
 from tests.page.whole_pages import watched_page
-from trilat_net.analysis.arm_rows import joint_positions_m
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, SiteEnergy
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
@@ -224,7 +224,7 @@ def test_a_users_page_draws_what_the_log_says(
         for name, (tick, points) in frame.items():
             expected_tick = own_tick if name == "m1" else shown_ticks[name][own_tick]
             q = np.array([log[name].states[tick].q])
-            logged_points_m = joint_positions_m(log.scenario.arms[name], q)[0]
+            logged_points_m = build_arm_rows(log.scenario, name).joint_positions_m(q)[0]
             assert tick == expected_tick
             assert points == np.round(logged_points_m, 5).tolist()
         ages_ticks.append(own_tick - frame["s"][0])

@@ -12,7 +12,7 @@ from trilat_people.live_page.terminal_watch import SessionWatch
 
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
-from trilat_net.analysis.arm_rows import build_arm_rows, joint_positions_m
+from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.app.monitor import StatusRow
 from trilat_net.app.running_session import RunningSession
 from trilat_net.log.log_reader import Log
@@ -53,7 +53,8 @@ def make_frame_collector(
 def compute_points(log: Log, site: str, tick: int) -> list[Any]:
     """Returns the points of an arm at a tick, rounded as in frames."""
     q = log[site].states[tick].q if tick >= 0 else log.scenario.sites[site].q0_rad
-    points = joint_positions_m(log.scenario.arms[site], np.array([q], dtype=np.float64))[0]
+    arm = build_arm_rows(log.scenario, site)
+    points = arm.joint_positions_m(np.array([q], dtype=np.float64))[0]
     return np.round(points, 5).tolist()  # type: ignore[no-any-return]
 
 

@@ -1,8 +1,8 @@
-"""Drivers of the input devices that a person holds to move an arm, one file for each device.
+"""Drivers for input devices with which a person moves an arm, one file per device.
 
-For example, `trilat hand m1 --device spacemouse` opens the class in the file spacemouse.py. A
-driver is a class with the interface `Device`. `open_device` finds a driver by the name of its
-file. Adding a driver therefore requires only a new file.
+A driver is a class that implements `Device`. `open_device` finds it by file name: for example,
+`trilat hand m1 --device spacemouse` opens the class in spacemouse.py. To add a driver, add a
+file.
 """
 
 from importlib import import_module
@@ -13,10 +13,10 @@ from trilat_net.errors import UsageError
 
 
 def open_device(text: str) -> Device:
-    """Connects to the input device, such as a SpaceMouse, that the option --device names.
+    """Connects to the input device given by the option --device.
 
     Args:
-        text: Value of the option: the name of the device, optionally followed by "=" and its
+        text: Value of the option: the name of a device, optionally followed by "=" and its
             address, as in "spacemouse" or "haply_inverse3=ws://127.0.0.1:10001".
 
     Raises:

@@ -1,11 +1,11 @@
-"""Connects to the haptic device Inverse3 of Haply, through the service of its maker.
+"""Driver for the Haply Inverse3 haptic device.
 
-The service is a program on the same machine. It exchanges JSON messages with this program over
-a WebSocket. This program sends a force, and the service replies with one state of the device. A
-new state therefore arrives only after the next force was sent, even if the force is zero.
+Communicates with the manufacturer's service, a program on the same machine, by JSON messages
+over a WebSocket. The service replies to each force with one state of the device, so a new state
+arrives only after the next force has been sent, even if the force is zero.
 
-If a message of the service cannot be parsed, the state is returned with a position that is not
-finite. The class `DeviceHand`, which moves the arm, ignores such a state.
+If a message from the service cannot be parsed, the state is returned with a non-finite
+position, which `DeviceHand` ignores.
 """
 
 import math
@@ -23,7 +23,7 @@ from trilat_net.net import check_hosts
 SILENCE_S = 0.15
 """Silence of the service after which the connection is closed, in s.
 
-This time is shorter than the silence after which the site releases the arm.
+Shorter than the silence after which the site releases the arm.
 """
 _NO_POSITION = (math.nan, math.nan, math.nan)
 """Position of a state that could not be parsed."""
@@ -35,21 +35,21 @@ _PARSE_ERRORS = (
     OverflowError,
     msgspec.MsgspecError,
 )
-"""Errors that a message with unexpected content may cause."""
+"""Errors that a message with unexpected content may raise."""
 _CONNECT_OPTIONS: dict[str, Any] = {
     "compression": None,
     "proxy": None,
     "ping_interval": None,
     "close_timeout": 0.2,
 }
-"""Options of the WebSocket for short delays."""
+"""WebSocket options for low latency."""
 
 
 class HaplyInverse3:
-    """The haptic device Inverse3 of Haply, as an input device that applies forces.
+    """Haply Inverse3: an input device with force feedback.
 
-    The device and its wireless grip are reached through version 3 of the maker's service, a
-    program that must run on this machine or another.
+    Connects to the device and its wireless grip through version 3 of the manufacturer's
+    service, which must be running on this or another machine.
 
     >>> tn.session("play").lead("m1", tn.HaplyInverse3())  # doctest: +SKIP
 
@@ -95,9 +95,7 @@ class HaplyInverse3:
         self._open.close()
 
     def read(self) -> DeviceState:
-        """Waits for the next state of the haptic device: position, velocity and buttons.
-
-        A service of its manufacturer sends the states.
+        """Waits for the next state of the device: position, velocity and buttons.
 
         Raises:
             ConnectionError: The service has no device, or has closed the connection.
@@ -117,12 +115,12 @@ class HaplyInverse3:
             return DeviceState(_NO_POSITION, _NO_POSITION, {})
 
     def _parse_state(self, message: Any) -> DeviceState:
-        """Returns position, velocity and buttons of the device from a message of its service.
+        """Extracts position, velocity and buttons from a message of the service.
 
-        The device is the first Inverse3 in the message. The buttons are those of all grips.
+        Uses the first Inverse3 in the message, and the buttons of all grips.
 
         Args:
-            message: Decoded message of the service.
+            message: Decoded message from the service.
 
         Raises:
             ConnectionError: The service has no Inverse3.
@@ -147,11 +145,11 @@ class HaplyInverse3:
     def render(self, force_n: Vector) -> None:
         """Sends a force to the device, which applies it to the person.
 
-        The message also requests the next state. Nothing is sent before the first state, which
-        contains the identity of the device.
+        The message also requests the next state. Nothing is sent before the first state has
+        arrived, since it contains the identity of the device.
 
         Args:
-            force_n: Coordinates x, y and z of the force, in N.
+            force_n: Force along x, y and z, in N.
         """
         if self._socket is None or not self._id:
             return
@@ -169,5 +167,5 @@ class HaplyInverse3:
 
 
 def _parse_vector(point: dict[str, float]) -> Vector:
-    """Returns a point of the service, {"x": ..., "y": ..., "z": ...}, as a tuple of floats."""
+    """Converts a point of the service, {"x": ..., "y": ..., "z": ...}, to a tuple of floats."""
     return float(point["x"]), float(point["y"]), float(point["z"])

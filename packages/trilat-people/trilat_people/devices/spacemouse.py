@@ -1,9 +1,8 @@
-"""Reads a SpaceMouse of 3Dconnexion on Linux, from its hidraw file.
+"""Driver for 3Dconnexion SpaceMouse devices on Linux, which reads their hidraw file.
 
-A SpaceMouse is an input device whose cap is pushed and turned by hand. The cap can only be
-deflected from its rest position. The deflection is interpreted as a velocity, which is
-integrated to obtain a position. If no report has arrived for `STILL_NS`, the cap is at rest,
-because a deflected cap reports continuously.
+A SpaceMouse has a cap that is pushed and turned by hand, away from its rest position. The
+deflection is interpreted as a velocity and integrated to obtain a position. A deflected cap
+reports continuously, so the cap is at rest if no report has arrived for `STILL_NS`.
 """
 
 import os
@@ -15,19 +14,19 @@ from trilat_net.app import DeviceState, Vector
 from trilat_net.net import Clock, SystemClock
 
 STILL_NS = 100_000_000
-"""Time without a report after which the cap counts as not deflected, in ns."""
+"""Time with no report after which the cap counts as not deflected, in ns."""
 SPEED_M_S = 0.2 / 350.0
 """Velocity per count of an axis, in m/s. A fully deflected cap reports 350 counts."""
 _MAKER_IDS = (":0000256F:", ":0000046D:0000C62")
-"""USB identifiers of a SpaceMouse in a uevent file: 3Dconnexion, and earlier Logitech."""
+"""USB vendor identifiers of a SpaceMouse in a uevent file: 3Dconnexion, formerly Logitech."""
 _MOTION_REPORT = 1
-"""Number of the reports that contain the deflection of the cap."""
+"""Identifier of reports that contain the deflection of the cap."""
 _BUTTON_REPORT = 3
-"""Number of the reports that contain the buttons."""
+"""Identifier of reports that contain the buttons."""
 
 
 class SpaceMouse:
-    """A SpaceMouse, a cap that is deflected by hand, as an input device without forces.
+    """3Dconnexion SpaceMouse: an input device with no force feedback.
 
     The deflection of the cap is integrated to obtain a position. The first two buttons are "a"
     and "b".
@@ -35,8 +34,8 @@ class SpaceMouse:
     >>> tn.session("play").lead("m1", tn.SpaceMouse("/dev/hidraw3"))  # doctest: +SKIP
 
     Args:
-        address: File of the device. If empty, the first SpaceMouse that is connected is used.
-        clock: Clock of this machine. If `None`, a clock is created.
+        address: Path of the hidraw file. If empty, the first SpaceMouse found is used.
+        clock: Clock of this machine. If `None`, a new clock is created.
     """
 
     rate_hz: ClassVar[int] = 125
@@ -59,7 +58,7 @@ class SpaceMouse:
 
     @staticmethod
     def find(devices: Path = Path("/sys/class/hidraw")) -> str:
-        """Returns the file of the first SpaceMouse that is connected, such as "/dev/hidraw3".
+        """Returns the path of the first connected SpaceMouse, such as "/dev/hidraw3".
 
         Args:
             devices: Folder in which Linux lists the hidraw devices.
@@ -77,14 +76,14 @@ class SpaceMouse:
         os.close(self._file)
 
     def read(self) -> DeviceState:
-        """Returns the present state of the device, whose cap a person pushes by hand.
+        """Returns the current state of the device.
 
-        The deflection of the cap is read as a velocity, which this method integrates to obtain
-        a position.
+        The deflection of the cap is interpreted as a velocity and integrated to obtain a
+        position.
 
         Returns:
-            The position relative to the position at the time of connection, the velocity, and
-            the state of the buttons.
+            The position relative to that at the time of connection, the velocity, and the
+            buttons.
         """
         now_ns = self._clock.monotonic_ns()
         while self._read_report(now_ns):
@@ -107,13 +106,13 @@ class SpaceMouse:
         return DeviceState(self._position_m, self._velocity_m_s, buttons)
 
     def _read_report(self, now_ns: int) -> bool:
-        """Reads the next report of the device, and stores the velocity or the buttons in it.
+        """Reads the next report of the device, and stores its velocity or buttons.
 
         Args:
-            now_ns: Present time, in ns.
+            now_ns: Current time, in ns.
 
         Returns:
-            True if a report was read. Another report may then follow. False if no report was
+            True if a report was read, in which case another may follow; False if no report was
             waiting.
 
         Raises:
@@ -137,8 +136,8 @@ class SpaceMouse:
         return True
 
     def render(self, force_n: Vector) -> None:
-        """Does nothing, because a SpaceMouse has no motors to apply a force.
+        """Does nothing, since a SpaceMouse has no motors.
 
         Args:
-            force_n: Coordinates x, y and z of the force, in N. They are ignored.
+            force_n: Ignored.
         """

@@ -1,6 +1,6 @@
-"""Plans, runs and evaluates experiments with people who operate the arms.
+"""Plans, runs and analyses experiments in which people operate the arms.
 
-`protocol` plans the trials, `experiment_run` runs them and stores their results,
+`protocol` plans the trials, `experiment_run` runs them and stores the results,
 `movement_measures` computes measures of each trial, and `experiment_analysis` compares the
-conditions of the experiment statistically.
+conditions statistically.
 """

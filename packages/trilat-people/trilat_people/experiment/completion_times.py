@@ -1,17 +1,17 @@
-"""Computes completion times of trials with a time limit: medians, intervals, and sign tests.
+"""Completion times of trials with a time limit: medians, confidence intervals and sign tests.
 
-A trial that was not completed has no completion time. If the trial reached the limit, its time
-is known only to be longer than the limit (right censoring). If the trial failed before the
-limit, the task was never completed. Both count as longer than every measured time.
+A trial that was not completed has no completion time. If it reached the limit, its time is only
+known to exceed the limit (right censoring). If it failed before the limit, the task was never
+completed. In both cases, the trial counts as longer than every measured time.
 
-This is enough for order statistics. The median of Kaplan and Meier is exact if more than half
-of the trials were completed. Otherwise the median was not reached. A mean would need the times
-themselves. Replacing unknown times with the limit would make different conditions look alike.
+This is sufficient for order statistics. The Kaplan-Meier median is exact if more than half of
+the trials were completed; otherwise the median was not reached. A mean would require the
+unknown times, and replacing them with the limit would make different conditions look alike.
 
 Invariant:
     - The limit is never used in a sum or a difference.
     - Trials are summarised per unit (a participant or a pair) and condition before units are
-      compared, so that more trials do not count as more participants.
+      compared, so more trials do not count as more participants.
 
 Sources: Kaplan and Meier, "Nonparametric estimation from incomplete observations", J. American
 Statistical Association 53 (1958); Conover, "Practical nonparametric statistics", 3rd edition
@@ -28,30 +28,29 @@ import numpy as np
 from .statistics import CONFIDENCE, Row, correct_holm, read_number
 
 COMPLETION = "completion_s"
-"""Column of the completion times."""
+"""Name of the column with completion times."""
 SUCCESS = "succeeded"
-"""Column that states whether a trial was completed."""
+"""Name of the column that tells whether a trial was completed."""
 
 
 class CompletionTime(NamedTuple):
-    """Completion time of the trials under one condition.
+    """Summary of the completion times under one condition.
 
-    Some trials may end without success at a time limit. Their completion time is not known,
-    except that it is longer than the limit (censored). Therefore medians are used instead of
-    means.
+    Uses medians instead of means, since the completion time of a trial that was not completed
+    is only known to exceed the time limit (censored).
 
     Attributes:
         condition: Name of the condition.
-        trials: Number of trials that are evaluated.
-        censored: Number of trials that were not completed, because they reached the time limit
-            (`timed_out`) or failed earlier.
+        trials: Number of trials evaluated.
+        censored: Number of trials not completed, either because they reached the time limit
+            (`timed_out`) or because they failed earlier.
         timed_out: Number of trials that reached the time limit.
         number: Number of units (participants or pairs).
-        median: Median over units of each unit's median time, in s. `None` if it was not
+        median: Median over units of each unit's median time, in s. `None` if the median was not
             reached.
-        interval: Confidence interval of the median, with a level of at least 95 %, by order
-            statistics, in s. The upper end is `None` if it was not reached. The whole interval
-            is `None` if there are too few units, or if the lower end was not reached either.
+        interval: Confidence interval of the median at a level of at least 95 %, from order
+            statistics, in s. The upper end is `None` if it was not reached. The entire interval
+            is `None` if there are too few units or the lower end was not reached either.
     """
 
     condition: str
@@ -64,22 +63,22 @@ class CompletionTime(NamedTuple):
 
 
 class CompletionComparison(NamedTuple):
-    """Comparison of the completion times of a task under two conditions of an experiment.
+    """Comparison of completion times between two conditions by a sign test.
 
-    The comparison uses a sign test, because trials that were not completed have no exact time.
+    A sign test is used because trials that were not completed have no exact time.
 
     Attributes:
         first: Name of the first condition.
         second: Name of the second condition.
         number: Number of units (participants or pairs) that have both conditions.
         longer: Number of units whose median was longer under the second condition.
-        shorter: Number of units whose median was shorter under the second condition. The other
-            units are ties, for example if both medians were not reached.
-        difference: Median over units of second minus first, in s. `None` if it depends on
-            medians that were not reached.
-        p: p value of the two-sided exact sign test without the ties. `None` for fewer than two
-            units that differ.
-        p_holm: p corrected for all comparisons.
+        shorter: Number of units whose median was shorter under the second condition. The
+            remaining units are ties, for example because neither median was reached.
+        difference: Median over units of the difference second minus first, in s. `None` if it
+            depends on medians that were not reached.
+        p: p value of the two-sided exact sign test, excluding ties. `None` if fewer than two
+            units differ.
+        p_holm: p value corrected for multiple comparisons.
     """
 
     first: str
@@ -93,10 +92,10 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Returns True if a trial was completed and its completion time is therefore known.
+    """Returns True if a trial was completed, so that its completion time is known.
 
     Args:
-        row: The trial, with values or with the texts of a CSV file. A row without the key
+        row: The trial, with typed values or strings from a CSV file. A row without the key
             `succeeded` counts as completed.
     """
     return str(row.get(SUCCESS, 1)).strip() not in ("0", "0.0", "False")
@@ -105,15 +104,11 @@ def is_completed(row: Row) -> bool:
 def find_median(times_s: Sequence[float]) -> float:
     """Computes the median of completion times, in s.
 
-    Trials that reached the time limit count as longer than all others, because their times are
-    not known.
-
     Args:
-        times_s: Times, in s. They are infinite for trials that were not completed.
+        times_s: Times, in s; infinite for trials that were not completed.
 
     Returns:
-        The median. It is infinite (not reached) if half of the trials or more were not
-        completed.
+        The median; infinite (not reached) if half or more of the trials were not completed.
     """
     sorted_s = sorted(times_s)
     count = len(sorted_s)
@@ -128,8 +123,8 @@ def find_unit_medians(
 ) -> dict[str, dict[str, float]]:
     """Returns the median completion time of each unit under each condition, in s.
 
-    A unit is a participant, or a pair whose members take part together. A median is infinite if
-    half or more of the trials were not completed in time.
+    A unit is a participant, or a pair of participants who take part together. The median is
+    infinite if half or more of the trials were not completed in time.
 
     Args:
         rows: Trials with `completion_s` and `succeeded`, as in `trials.csv`.
@@ -159,21 +154,20 @@ def find_unit_medians(
 def summarise_times(
     rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 ) -> list[CompletionTime]:
-    """Returns the median completion time, and its interval, under each condition.
+    """Returns the median completion time under each condition, with a confidence interval.
 
     The median is first taken over the trials of each participant (or pair), and then over the
-    participants. The median is `None` if it was not reached, because too many trials were not
-    completed.
+    participants. It is `None` if it was not reached because too many trials were not completed.
 
     Args:
-        rows: Trials as mappings with the keys `condition`, `completion_s`, `succeeded`, and the
-            key that `unit` names, as in `trials.csv`.
+        rows: Trials as mappings with the keys `condition`, `completion_s`, `succeeded` and the
+            key given by `unit`, as in `trials.csv`.
         limit_s: Time limit of a trial, in s.
-        unit: "participant" if participants are independent of each other. "pair" if the two
-            members of a pair did the trials together, and only pairs are independent.
+        unit: "participant" if participants are independent of each other; "pair" if two
+            participants did the trials together, so that only pairs are independent.
 
     Returns:
-        A summary per condition, in the order in which the conditions first occur.
+        One summary per condition, in the order in which the conditions first occur.
     """
     summaries: list[CompletionTime] = []
     for condition, medians_by_unit in find_unit_medians(rows, unit).items():
@@ -198,17 +192,17 @@ def summarise_times(
 
 
 def _find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
-    """Returns a confidence interval of at least 95 % for a median, by order statistics.
+    """Returns a confidence interval of at least 95 % for a median, from order statistics.
 
     The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B <
-    r), where B is binomial with p = 1/2. r is the largest rank for which this probability is 95
-    % or more.
+    r), where B is binomial with p = 1/2. r is the largest rank for which this probability is at
+    least 95 %.
 
     Args:
-        times_s: Times, in s. They are infinite for trials that were not completed.
+        times_s: Times, in s; infinite for trials that were not completed.
 
     Returns:
-        Lower and upper end, in s. The upper end is `None` if it was not reached. The whole
+        Lower and upper end, in s. The upper end is `None` if it was not reached. The entire
         interval is `None` if there is no such rank, which is the case for fewer than six times.
     """
     # imported late: the import takes half a second, and trials do not need it
@@ -235,16 +229,16 @@ def compare_times(
 ) -> list[CompletionComparison]:
     """Compares the completion times of each pair of conditions by sign tests.
 
-    The comparison is made within each unit (a participant, or a pair of participants). A unit
-    counts for the condition under which its median is longer. A median that was not reached is
-    longer than any median that was reached. Two medians that were not reached are a tie.
+    The comparison is made within each unit (a participant, or a pair of participants), based on
+    which condition has the longer median. A median that was not reached is longer than any
+    median that was. Two medians that were not reached are tied.
 
     Args:
         rows: Trials, as for `find_unit_medians`.
-        unit: "participant" or "pair", which is sampled independently.
+        unit: The independently sampled unit, "participant" or "pair".
 
     Returns:
-        A comparison for each pair of conditions, in the order of the rows.
+        One comparison per pair of conditions, in the order of the rows.
     """
     medians = find_unit_medians(rows, unit)
     comparisons = []
@@ -264,13 +258,13 @@ def compare_times(
 def _compare(
     first: str, second: str, pairs: Sequence[tuple[float, float]]
 ) -> CompletionComparison:
-    """Compares the completion times of two conditions by a sign test, which needs no means.
+    """Compares the completion times of two conditions with a sign test, which needs no means.
 
     Args:
         first: Name of the first condition.
         second: Name of the second condition.
-        pairs: Medians of each unit under both conditions, in s. A median that was not reached
-            is infinite.
+        pairs: Medians of each unit under both conditions, in s; infinite if a median was not
+            reached.
     """
     # imported late: the import takes half a second, and trials do not need it
     from scipy import stats
@@ -297,14 +291,14 @@ def _compare(
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
     """Returns the median of the differences between two conditions, in s.
 
-    A median that was not reached may have any value above 0. Therefore each difference lies
-    between two bounds. The median difference is known if the medians of both bounds agree.
+    A median that was not reached may have any positive value, so each difference lies between
+    two bounds. The median difference is known if the medians of both bounds agree.
 
     Args:
         pairs: Medians of each unit under both conditions, in s.
 
     Returns:
-        The median difference. `None` if it depends on medians that were not reached.
+        The median difference, or `None` if it depends on medians that were not reached.
     """
     if not pairs:
         return None
@@ -323,5 +317,5 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
 
 
 def _replace_infinity(time_s: float) -> float | None:
-    """Returns a median for a result: `None` instead of infinity if it was not reached."""
+    """Returns `None` in place of an infinite median, that is, one that was not reached."""
     return time_s if math.isfinite(time_s) else None

@@ -1,14 +1,13 @@
-"""Draws figures that compare a measure between the conditions of an experiment with people.
+"""Figures that compare a measure between the conditions of an experiment with people.
 
 `draw_conditions` shows a measure by condition, and `draw_learning` shows it over the trials of
 a block. If some trials were not completed in time, their completion time is only known to
-exceed the limit. A mean does not exist in this case, and `draw_times` shows medians instead.
+exceed the limit, so there is no mean, and `draw_times` shows medians instead.
 
 Invariant:
-    - For each participant, a point is drawn for each condition with data, and a thin line joins
-      the points.
-    - Means with their intervals are drawn on top.
-    - Equal rows give equal bytes.
+    - Each participant is drawn as one point per condition with data, joined by a thin line.
+    - Means and their intervals are drawn on top.
+    - Equal rows give byte-identical figures.
 """
 
 import math
@@ -27,7 +26,7 @@ from .completion_times import COMPLETION, find_median, find_unit_medians, summar
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 
 Look = dict[str, Any]
-"""Options of matplotlib for a line and its markers."""
+"""Matplotlib options for a line and its markers."""
 
 _FORM = FigureSize.for_print(COLUMN_IN)
 _HEIGHT_IN = 2.6
@@ -48,15 +47,15 @@ _LIMIT: Look = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
-    """Draws one measure of an experiment, such as the completion time, under each condition.
+    """Plots one measure of an experiment, such as the completion time, by condition.
 
-    The figure shows the mean of each participant (or pair of participants), and the mean over
-    them with its 95 % interval.
+    Shows the mean of each participant (or pair of participants), and the overall mean with its
+    95 % confidence interval.
 
     Args:
-        rows: A row per trial, as for `statistics`.
+        rows: One row per trial, as for `statistics`.
         measure: Name of the measure in the rows.
-        unit: "participant" or "pair", for which means are computed first.
+        unit: Unit over which trials are averaged first, "participant" or "pair".
     """
     all_means = average_trials(rows, measure, unit)
     means = {condition: by_unit for condition, by_unit in all_means.items() if by_unit}
@@ -82,15 +81,15 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
 
 
 def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant") -> Figure:
-    """Draws the completion times under each condition, for trials with a time limit.
+    """Plots the completion times under each condition, for trials with a time limit.
 
-    The points are the medians of each participant or pair. An open marker on the line of the
+    Points are the medians of each participant or pair. An open marker on the line of the time
     limit represents a median beyond the limit.
 
     Args:
-        rows: A row per trial, as for `completion_times`.
+        rows: One row per trial, as for `completion_times`.
         limit_s: Time limit of a trial, in s.
-        unit: "participant" or "pair", for which medians are computed first.
+        unit: Unit over which medians are taken first, "participant" or "pair".
     """
     medians = find_unit_medians(rows, unit)
     interval_style = {**_MEAN, "marker": "_"}
@@ -128,13 +127,13 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 def _list_unit_lines(
     values: Mapping[str, Mapping[str, float]],
 ) -> Iterator[tuple[list[int], list[float]]]:
-    """Yields the points of each participant or pair, which a thin line joins in the figure.
+    """Yields the points of each participant or pair, which the figure joins with a thin line.
 
     Args:
-        values: A value by condition and unit. Each condition is a column of the figure.
+        values: Value by condition and unit. Each condition is a column of the figure.
 
     Yields:
-        The indices of the columns, and their values. Conditions without a value are left out.
+        Indices of the columns, and their values. Conditions with no value are skipped.
     """
     all_units = chain.from_iterable(values.values())
     for unit in dict.fromkeys(all_units):
@@ -148,7 +147,7 @@ def _list_unit_lines(
 
 
 def _label_conditions(axes: Axes, values: Mapping[str, Mapping[str, float]]) -> None:
-    """Labels the horizontal axis with each condition and its number of participants or pairs.
+    """Labels the x axis with each condition and its number of participants or pairs.
 
     Args:
         axes: The panel.
@@ -170,12 +169,12 @@ def _plot_times(
     limit_s: float,
     look: Look,
 ) -> None:
-    """Draws completion times as a line, with an open marker for each time beyond the limit.
+    """Plots completion times as a line, with an open marker for each time beyond the limit.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        positions: Positions of the times along the horizontal axis.
-        times_s: The times, in s. They are infinite beyond the limit.
+        positions: Positions along the x axis.
+        times_s: The times, in s; infinite if beyond the limit.
         limit_s: Time limit of a trial, in s.
         look: Options of the line and its markers.
     """
@@ -197,9 +196,10 @@ def _mark_beyond_limit(
 
     Args:
         axes: The panel.
-        positions: Horizontal positions of the markers.
+        positions: Positions of the markers along the x axis.
         limit_s: Time limit of a trial, in s.
-        look: Plot options of the condition, which determine shape and colour of the markers.
+        look: Plot options of the condition, which determine the shape and colour of the
+            markers.
     """
     open_marker: Look = {
         "marker": look["marker"],
@@ -219,16 +219,16 @@ def draw_learning(
     unit: str = "participant",
     limit_s: float | None = None,
 ) -> Figure:
-    """Draws how a measure changes from trial to trial of a block, with a line per condition.
+    """Plots how a measure changes from trial to trial of a block, with one line per condition.
 
     Args:
-        rows: A row per trial, as for `statistics`, with the number of each `trial` in its
-            block.
+        rows: One row per trial, as for `statistics`, including the number `trial` of the trial
+            in its block.
         measure: Name of the measure in the rows.
-        unit: "participant" or "pair", for which means are computed first.
-        limit_s: Time limit of a trial, in s, if some trials were not completed in time. The
-            figure then shows medians, and open markers on the line of the limit for medians
-            beyond it. `None` if all trials were completed.
+        unit: Unit over which trials are averaged first, "participant" or "pair".
+        limit_s: Time limit of a trial, in s, if some trials were not completed in time; medians
+            are then plotted, with open markers on the line of the limit for medians beyond it.
+            `None` if all trials were completed.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
@@ -254,9 +254,10 @@ def draw_learning(
 
 
 def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
-    """Returns the plot options of the line of each experimental condition, such as its colour.
+    """Returns a mapping from condition to the plot options of its line, such as the colour.
 
-    Colours follow the order in which conditions appear in the rows, and repeat after the last.
+    Colours are assigned in the order in which conditions appear in the rows, and are reused
+    once exhausted.
     """
     conditions = dict.fromkeys(row["condition"] for row in rows)
     looks: dict[str, Look] = {}
@@ -267,13 +268,13 @@ def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
 
 
 def _label_trials(axes: Axes) -> None:
-    """Labels the horizontal axis with the numbers of the trials."""
+    """Labels the x axis with trial numbers."""
     axes.set_xlabel("trial of the block")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
 
 
 def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]:
-    """Returns the rows of a condition by the number of the trial in its block, ascending."""
+    """Groups the rows of a condition by trial number in the block, in ascending order."""
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         if row["condition"] == condition:
@@ -283,10 +284,10 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 
 
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
-    """Draws how the median completion time changes over the trials of a block.
+    """Plots how the median completion time changes over the trials of a block.
 
-    The task has a time limit, and some trials were not completed, so means do not exist. A
-    median beyond the limit has an open marker on the line of the limit.
+    Used when some trials were not completed within the time limit, so that means do not exist.
+    A median beyond the limit is drawn as an open marker on the line of the limit.
 
     Args:
         rows: Rows of the trials.
@@ -316,9 +317,9 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
 
 
 def _add_panel(figure: Figure, measure: str) -> Axes:
-    """Adds the only panel of a figure, with a vertical axis for one measure.
+    """Adds the only panel of a figure, with a y axis for one measure.
 
-    The unit is the end of the measure's name: "path_m" is labelled "path, m".
+    The unit is taken from the end of the measure's name: "path_m" is labelled "path, m".
     """
     panels = style.add_panels(figure, 1, 1)
     axes: Axes = panels[0, 0]
@@ -333,7 +334,7 @@ def _plot_interval(axes: Axes, position: float, mean: ConditionMean, look: Look)
 
     Args:
         axes: The panel.
-        position: Horizontal position of the condition.
+        position: Position of the condition along the x axis.
         mean: Mean of the condition. With a single participant, there is no interval.
         look: Plot options.
     """

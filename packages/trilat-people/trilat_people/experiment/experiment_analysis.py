@@ -1,13 +1,13 @@
-"""Analyses an experiment with people: means, comparisons of the conditions, and figures.
+"""Analyses an experiment with people: means, comparisons between conditions, and figures.
 
-`analyse_experiment` reads the results that were stored during the experiment, and writes
-tables, figures and a report into the folder of the experiment. `compute_experiment_power` is
-called before an experiment, to plan the number of participants.
+`analyse_experiment` reads the stored results and writes tables, figures and a report into the
+folder of the experiment. `compute_experiment_power` is used before an experiment to plan the
+number of participants.
 
 Invariant:
     - The analysis depends only on the stored results.
-    - Practice and catch trials are not evaluated.
-    - A trial that was not completed is evaluated. Its completion time is censored: it counts as
+    - Practice trials and catch trials are excluded.
+    - A trial that was not completed is included. Its completion time is censored: it counts as
       longer than that of any completed trial (see `completion_times`).
     - Every number in a figure or a sentence is also in a table.
 """
@@ -68,25 +68,25 @@ MEASURES = (
     "internal_share", "first_effort_share", "first_work_j", "second_work_j", "first_taken_j",
     "second_taken_j", "succeeded",
 )  # fmt: skip
-"""Measures that are compared between conditions if trials have them."""
+"""Measures to compare between conditions if trials have them."""
 _UNCOUNTED_PHASES = ("before", "training", "retention")
-"""Phases of a training that are not compared between conditions."""
+"""Training phases excluded from the comparison between conditions."""
 FOLDER = "analysis"
-"""Folder of the analysis inside the folder of the experiment."""
+"""Name of the analysis folder inside the folder of the experiment."""
 NOT_REACHED = "not reached"
-"""Text of a median if half of the trials or more were not completed."""
+"""Text shown for a median if half or more of the trials were not completed."""
 
 
 class _MissingAnswers(NamedTuple):
-    """Number of answers that are missing in the questionnaires under one condition.
+    """Number of missing answers to a questionnaire under one condition.
 
     Attributes:
         questionnaire: Name of the questionnaire.
         condition: Condition of the block. Empty for a questionnaire after the experiment.
         asked: Number of items, over all completed questionnaires.
-        missing: Number of these items without an answer.
+        missing: Number of these items with no answer.
         forms: Number of completed questionnaires.
-        unscored: Number of questionnaires without a score because an answer is missing.
+        unscored: Number of questionnaires with no score because an answer is missing.
     """
 
     questionnaire: str
@@ -98,14 +98,14 @@ class _MissingAnswers(NamedTuple):
 
 
 def _format_fact(value: Any, name: str = "") -> str:
-    """Returns a fact of a study as text, for example "delay 50 ms" for {"delay_ms": 50}.
+    """Formats a fact about the study, for example "delay 50 ms" for {"delay_ms": 50}.
 
-    A number is followed by the unit at the end of its name, and has all digits. Several entries
-    or items are joined by commas, and conditions by semicolons.
+    A number is written in full and followed by the unit from the end of its name. Entries or
+    items are joined with commas, and conditions with semicolons.
 
     Args:
-        value: The fact: a number, a text, a mapping or a sequence.
-        name: Name of the fact, whose ending states the unit.
+        value: The fact: a number, a string, a mapping or a sequence.
+        name: Name of the fact, which ends in the unit.
     """
     if isinstance(value, str):
         return value
@@ -125,43 +125,43 @@ def _format_fact(value: Any, name: str = "") -> str:
 
 
 class ExperimentAnalysis(Result):
-    """The statistics of an experiment: comparisons of its conditions, and facts of the study.
+    """Statistics of an experiment: comparisons between conditions, and facts to report.
 
-    Creating this object computes everything except the figures, which `write` draws. A unit is
-    a participant or a pair, whichever is sampled independently. Every measure that trials have
-    is summarised, even if all of its values are equal. If values of a measure are missing,
-    their number is stated.
+    Everything is computed on construction, except for the figures, which are drawn by `write`.
+    A unit is a participant or a pair, whichever is sampled independently. Every measure of the
+    trials is summarised, even if all of its values are equal. The number of missing values is
+    reported.
 
     Args:
-        experiment: The experiment in its folder.
-        exclude: Participants or pairs whose data are left out, with the reasons.
+        experiment: The experiment to analyse.
+        exclude: Mapping from each participant or pair to exclude to the reason.
 
     Attributes:
-        unit: "participant" or "pair", which is sampled independently.
-        rows: Evaluated trials, as a table. If there is a training, only trials after it are
+        unit: The independently sampled unit, "participant" or "pair".
+        rows: Table of evaluated trials. If there is a training, only trials after it are
             included.
-        learning_rows: Evaluated trials in all phases of a training.
-        throughput_rows: Throughput (speed and accuracy in one number) of each unit and
+        learning_rows: Table of evaluated trials in all phases of a training.
+        throughput_rows: Throughput (a combined measure of speed and accuracy) by unit and
             condition.
-        gain_rows: Improvement by a training, of each unit and condition.
-        threshold_rows: Threshold of perception by a staircase, of each unit and condition.
-        means: For each measure, the mean under each condition. `completion_s` is included only
-            if all trials were completed.
-        comparisons: For each measure, the comparison of each pair of conditions.
+        gain_rows: Improvement through training, by unit and condition.
+        threshold_rows: Perception threshold from a staircase, by unit and condition.
+        means: Mapping from measure to its mean under each condition. `completion_s` is included
+            only if all trials were completed.
+        comparisons: Mapping from measure to the comparisons of all pairs of conditions.
         times: Completion time under each condition, for a task with a time limit.
         time_comparisons: Comparison of the completion times of each pair of conditions, if some
             trials were not completed.
-        missing_answers: Missing answers of each questionnaire and condition.
-        absent: For each measure that this experiment could have but that has no value in any
-            trial, the reason.
-        models: Mixed models of the forces of users within pairs.
-        study: Facts of the study that a paper states: participants, conditions with the
-            measured delays, law, gains, seed, and the analyses that were computed.
-        paths: Files that were written.
+        missing_answers: Missing answers by questionnaire and condition.
+        absent: Mapping from each applicable measure that has no value in any trial to the
+            reason.
+        models: Mixed models of the users' forces, with users nested in pairs.
+        study: Facts to report in a paper: participants, conditions with the measured delays,
+            law, gains, seed, and the analyses performed.
+        paths: Paths of the files written.
 
     Raises:
-        UsageError: No evaluated trial is finished, or an excluded participant or pair does not
-            exist.
+        UsageError: No trial to evaluate has finished, or an excluded participant or pair does
+            not exist.
     """
 
     def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
@@ -211,9 +211,9 @@ class ExperimentAnalysis(Result):
         self.paths: list[Path] = []
 
     def _check_excluded(self) -> None:
-        """Checks that the participants or pairs that the user excludes exist.
+        """Raises UsageError if an excluded participant or pair does not exist.
 
-        Otherwise a misspelled name would have no effect, and no error would be raised.
+        Otherwise, a misspelt name would silently have no effect.
 
         Raises:
             UsageError: An excluded name is not in the plan. The error lists the names in the
@@ -230,10 +230,9 @@ class ExperimentAnalysis(Result):
             )
 
     def _is_counted(self, row: Mapping[str, Any]) -> bool:
-        """Returns True if a trial enters the statistics.
+        """Returns True if a trial is included in the statistics.
 
-        Practice trials, catch trials (which check attention), and the trials of excluded
-        participants do not.
+        Practice trials, catch trials and the trials of excluded participants are not.
 
         Args:
             row: Row of the trial, as in trials.csv.
@@ -242,9 +241,9 @@ class ExperimentAnalysis(Result):
         return not (is_excluded or row["practice"] or row["catch"])
 
     def _sort_by_condition(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Returns table rows in the order in which the experiment's protocol lists conditions.
+        """Sorts table rows by condition, in the order of the experiment's protocol.
 
-        Rows of one condition keep their order.
+        The sort is stable.
         """
         conditions = list(self._experiment.plan.protocol.conditions)
         return sorted(rows, key=lambda row: conditions.index(row["condition"]))
@@ -252,18 +251,18 @@ class ExperimentAnalysis(Result):
     def _list_unit_measures(self) -> list[str]:
         """Lists the measures that have only one value per participant and condition.
 
-        Examples are gains by a training and perception thresholds, with names that begin with
-        "gain_" or "threshold_". In an experiment with pairs, a pair has one value.
+        Examples are training gains ("gain_...") and perception thresholds ("threshold_..."). In
+        an experiment with pairs, each pair has one value.
         """
         keys = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
         return [key for key in keys if key.startswith(("gain_", "threshold_"))]
 
     def _compare_measure(self, measure: str) -> None:
-        """Stores the means of a measure per condition, and the tests between conditions.
+        """Computes the means of a measure per condition, and the tests between conditions.
 
-        A measure without a value in any trial is left out. Completion times are also left out
-        if some of them are censored (known only to exceed the limit), because their mean would
-        be biased.
+        Measures with no value in any trial are skipped. Completion times are also skipped if
+        some of them are censored (known only to exceed the limit), since their mean would be
+        biased.
 
         Args:
             measure: Name of the measure, for example "path_m".
@@ -278,10 +277,10 @@ class ExperimentAnalysis(Result):
             self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
 
     def _has_censored_times(self) -> bool:
-        """Returns True if participants did not complete some of the trials.
+        """Returns True if some of the trials were not completed.
 
-        Completion times of such trials are only known to be longer than the limit (censored).
-        The analysis then uses medians in place of means.
+        The completion times of such trials are only known to exceed the limit (censored), so
+        the analysis uses medians in place of means.
         """
         return any(time.censored for time in self.times)
 
@@ -292,28 +291,27 @@ class ExperimentAnalysis(Result):
 
     @property
     def _is_reaching(self) -> bool:
-        """True if the task is to reach targets, which is the only task with a throughput."""
+        """True if the task is to reach targets, the only task with a throughput."""
         return self._experiment.plan.protocol.task.description.startswith("reaching")
 
     def _summarise_times(self) -> None:
-        """Stores the median completion time of each condition.
+        """Computes the median completion time of each condition.
 
-        If some trials were not completed, the method also compares the conditions by sign
-        tests, because a t test needs means.
+        If some trials were not completed, also compares the conditions with sign tests, since a
+        t test needs means.
         """
         self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
         if self._has_censored_times():
             self.time_comparisons = compare_times(self.rows, unit=self.unit)
 
     def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
-        """Explains in the report why measures that this experiment could have are missing.
+        """Explains why measures that this experiment could have are missing.
 
         Args:
             forms: Names of the questionnaires that are answered after each block.
 
         Returns:
-            The reasons by the names of the measures, for example {"tlx": "nobody has answered
-            it"}.
+            Mapping from measure to the reason, for example {"tlx": "nobody has answered it"}.
         """
         reasons = {}
         for name in forms:
@@ -329,17 +327,17 @@ class ExperimentAnalysis(Result):
         return reasons
 
     def _count_missing_answers(self) -> Iterator[_MissingAnswers]:
-        """Counts the missing answers of each questionnaire, separately for each condition.
+        """Counts the missing answers to each questionnaire under each condition.
 
-        A questionnaire has several items. A completed questionnaire, called form, belongs to
-        one participant and one block of trials. Two numbers are counted: the items without an
-        answer, and the forms that have no score because at least one answer is missing.
+        A completed questionnaire, called a form, belongs to one participant and one block of
+        trials. Counts both the items with no answer and the forms that have no score because at
+        least one answer is missing.
 
-        A block has one condition. A questionnaire that people answer only once, after the whole
-        experiment, belongs to no condition. Its condition is the empty text.
+        A questionnaire that is answered only once, after the experiment, does not belong to any
+        condition; its condition is the empty string.
 
         Yields:
-            The counts for each questionnaire and condition, without excluded participants.
+            The counts for each questionnaire and condition, excluding excluded participants.
         """
         protocol = self._experiment.plan.protocol
         when_answered = {form.name: form.after for form in protocol.questionnaires}
@@ -368,7 +366,7 @@ class ExperimentAnalysis(Result):
             )
 
     def of(self, measure: str) -> Sequence[Row]:
-        """Returns the rows of the result table that contains a given measure.
+        """Returns the rows of the result table that contains a measure.
 
         Depending on the measure, a row is a trial, a participant or pair, or a completed
         questionnaire.
@@ -377,8 +375,8 @@ class ExperimentAnalysis(Result):
             measure: Name of the measure, such as "completion_s".
 
         Returns:
-            The rows, as mappings from column names to values. Empty if no questionnaire has the
-            measure.
+            The rows, each a mapping from column name to value. Empty if no questionnaire has
+            the measure.
         """
         rows_by_kind = {
             "throughput": self.throughput_rows,
@@ -395,8 +393,8 @@ class ExperimentAnalysis(Result):
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
         """Yields the throughput of each participant or pair under each condition, in bit/s.
 
-        The throughput combines the speed and the accuracy of aimed movements. It needs at least
-        two completed trials, and only the reaching task has it.
+        Throughput combines the speed and accuracy of aimed movements. It requires at least two
+        completed trials, and is defined only for the reaching task.
 
         Yields:
             Rows with the name, the condition and "throughput_bits_s".
@@ -427,10 +425,10 @@ class ExperimentAnalysis(Result):
                 }
 
     def _find_gains(self) -> Iterator[dict[str, Any]]:
-        """Yields the improvement of each participant (or pair) by a training, by condition.
+        """Yields the improvement of each participant (or pair) through training, by condition.
 
-        A gain is the mean before the training minus the mean right after it (transfer), or
-        minus the mean in the later test (retention).
+        A gain is the mean before the training minus the mean directly after it (transfer) or in
+        the later test (retention).
         """
         measure = self._experiment.plan.protocol.task.learning_measure
         means_by_phase: dict[str, dict[str, dict[str, float]]] = {}
@@ -452,8 +450,8 @@ class ExperimentAnalysis(Result):
     def _is_censored(self, measure: str) -> bool:
         """Returns True if a measure is the completion time and some trials were not completed.
 
-        In contrast to `_has_censored_times`, the trials of all phases of a training are
-        considered. The result decides whether means or medians are computed.
+        Unlike `_has_censored_times`, considers all phases of a training. The result determines
+        whether means or medians are computed.
 
         Args:
             measure: Name of a measure.
@@ -468,8 +466,8 @@ class ExperimentAnalysis(Result):
     ) -> dict[str, dict[str, float]]:
         """Returns the mean of a learning measure for each condition and participant or pair.
 
-        If some trials were not completed, medians are used instead of means. A median that was
-        not reached is left out.
+        If some trials were not completed, medians are used instead of means, and those that
+        were not reached are omitted.
         """
         if not self._is_censored(measure):
             return average_trials(rows, measure, self.unit)
@@ -483,9 +481,8 @@ class ExperimentAnalysis(Result):
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
         """Yields the perception threshold of each participant under each condition.
 
-        A staircase procedure changes a difference until the participant just perceives it.
-        Blocks with too few reversals of the staircase have no threshold, and protocols without
-        a staircase have no thresholds at all.
+        A staircase varies a difference until the participant can just perceive it. Blocks with
+        too few reversals have no threshold, and neither do protocols with no staircase.
 
         Yields:
             Rows with the name, the condition, and the threshold under the name of its measure.
@@ -510,15 +507,15 @@ class ExperimentAnalysis(Result):
                 }
 
     def _collect_study(self) -> dict[str, Any]:
-        """Returns the facts of the study that a paper should state.
+        """Returns the facts about the study that a paper should report.
 
-        Facts that do not apply, such as `pairs` in an experiment with single users, are left
-        out.
+        Facts that do not apply, such as `pairs` in an experiment with single users, are
+        omitted.
 
         Returns:
-            Plain values by name. `conditions` maps each condition to the mean of the measured
-            delays, `delay_ms`. `excluded` is the number of participants of the plan whose data
-            are left out. `computed` lists the analyses, for example "t tests".
+            Mapping from name to plain value. `conditions` maps each condition to the mean
+            measured delay, `delay_ms`. `excluded` is the number of planned participants whose
+            data are excluded. `computed` lists the analyses, for example "t tests".
         """
         plan = self._experiment.plan
         protocol = plan.protocol
@@ -560,10 +557,9 @@ class ExperimentAnalysis(Result):
         return {name: value for name, value in facts.items() if value is not None}
 
     def _list_computed(self) -> list[str]:
-        """Returns the names of the statistical methods that were applied, for the report.
+        """Returns the names of the statistical methods used, for the report.
 
-        An example is ["intervals of 95 %", "effect sizes"]. With one participant the list is
-        empty.
+        An example is ["intervals of 95 %", "effect sizes"]. Empty for a single participant.
         """
         tests = list(chain.from_iterable(self.comparisons.values()))
         means = list(chain.from_iterable(self.means.values()))
@@ -582,12 +578,10 @@ class ExperimentAnalysis(Result):
         return [analysis for analysis, computed in is_computed.items() if computed]
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
-        """Writes the tables, figures and the report of an experiment into a folder.
-
-        Afterwards, `paths` lists the written files.
+        """Writes the tables, figures and report of the analysis, and lists them in `paths`.
 
         Args:
-            folder: Folder of the files.
+            folder: Folder to write to.
 
         Returns:
             This analysis.
@@ -608,10 +602,10 @@ class ExperimentAnalysis(Result):
         return self
 
     def _encode_files(self) -> dict[str, str]:
-        """Returns the contents of all result files except figures, by file name.
+        """Returns a mapping from file name to content of all result files except figures.
 
-        They are CSV tables and a JSON file. Tables about completion times and missing answers
-        exist only if they have a row.
+        These are CSV tables and a JSON file. Tables of completion times and missing answers are
+        included only if they have rows.
         """
         tables = {
             "conditions.csv": self._list_means(),
@@ -632,13 +626,11 @@ class ExperimentAnalysis(Result):
         return texts
 
     def _draw_figures(self) -> dict[str, Any]:
-        """Draws a figure for each measure, and one that shows learning over the trials.
-
-        The figures are part of the page that reports the results.
+        """Draws one figure per measure, and one that shows learning over the trials.
 
         Returns:
-            The figures by the names of their files without the ending. "learning" exists only
-            if there is more than one trial in a block.
+            Mapping from file name, excluding the suffix, to figure. "learning" is included only
+            if a block has more than one trial.
         """
         figures = {}
         for name in self.means:
@@ -658,13 +650,10 @@ class ExperimentAnalysis(Result):
         return figures
 
     def compose_page(self, figures: Sequence[str]) -> str:
-        """Composes the Markdown page that reports the results of the experiment.
+        """Returns the Markdown page that reports the results of the experiment.
 
         Args:
-            figures: Names of the PNG files beside the page, without the suffix.
-
-        Returns:
-            The text of the page.
+            figures: Names of the PNG files in the folder of the page, without the suffix.
         """
         protocol = self._experiment.plan.protocol
         paragraphs = [f"# {protocol.title or protocol.name}"]
@@ -679,14 +668,13 @@ class ExperimentAnalysis(Result):
         return "\n\n".join(paragraphs) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
-        """Fits mixed models to the mean and the peak force of users who act in pairs.
+        """Fits mixed models to the mean and peak force of users who act in pairs.
 
-        A mixed model accounts for the fact that the two users of a pair are not independent.
+        A mixed model accounts for the dependence between the two users of a pair.
 
         Yields:
-            One model for each of the two measures, as soon as it is fitted. There are no models
-            if participants act alone, if there are too few pairs, or if the package statsmodels
-            is not installed.
+            One model per measure, as soon as it is fitted. Yields nothing if participants act
+            alone, if there are too few pairs, or if the package statsmodels is not installed.
         """
         pairs = {row[self.unit] for row in self.rows}
         has_pairs = self.unit == "pair" and len(pairs) >= 2
@@ -705,25 +693,24 @@ class ExperimentAnalysis(Result):
                 yield fit_mixed_model(rows, f"{measure}_n")
 
     def _list_means(self) -> list[dict[str, Any]]:
-        """Returns the table conditions.csv: a row for each measure and condition."""
+        """Returns the table conditions.csv, with one row per measure and condition."""
         rows: list[dict[str, Any]] = []
         for measure, means in self.means.items():
             rows += [{"measure": measure, **mean._asdict()} for mean in means]
         return rows
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the comparisons, one row per measure and pair of conditions.
+        """Returns the comparisons as a table, with one row per measure and pair of conditions.
 
-        The file comparisons.csv and the data frame of this result have these rows.
+        These are the rows of comparisons.csv and of the data frame of this result.
         """
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns all results of the experiment as plain values.
+        """Returns all results as plain values for `trilat experiment analyse --json`.
 
-        These are the means of the conditions, their comparisons, completion times, missing
-        answers, fitted models and the facts of the study. `trilat experiment analyse --json`
-        prints them.
+        Includes the means of the conditions, their comparisons, completion times, missing
+        answers, fitted models and the facts about the study.
         """
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
@@ -743,12 +730,12 @@ class ExperimentAnalysis(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat experiment analyse` prints.
+        """Yields the parts of the report that `trilat experiment analyse` prints.
 
-        The parts are a summary of completed trials, the means and comparisons of the measures,
-        the fitted models, the number of missing questionnaire answers, the reasons why a
-        measure has no value, and the facts of the study. With a single participant or pair
-        there are no comparisons, and one table has all measures.
+        These are a summary of completed trials, the means and comparisons of the measures, the
+        fitted models, the number of missing questionnaire answers, the reasons why a measure
+        has no value, and the facts about the study. With a single participant or pair, there
+        are no comparisons, and all measures are in one table.
         """
         yield from self._write_time_blocks()
 
@@ -784,8 +771,8 @@ class ExperimentAnalysis(Result):
     def _write_time_blocks(self) -> Iterator[Block]:
         """Yields a table of completion times: trials, failures and median for each condition.
 
-        A second table compares the conditions if some trials were not completed. Nothing is
-        yielded for a task without a time limit.
+        If some trials were not completed, a second table compares the conditions. Yields
+        nothing for a task with no time limit.
         """
         if not self.times:
             return
@@ -839,7 +826,7 @@ class ExperimentAnalysis(Result):
     def _write_measure_blocks(self) -> Iterator[Block]:
         """Yields two tables for each measure: means of the conditions, and their comparisons.
 
-        The second table is left out if there is only one condition.
+        The second table is omitted if there is only one condition.
         """
         for measure, means in self.means.items():
             yield f"{measure}, mean over {self.unit}s, {100 * CONFIDENCE:g} % interval"
@@ -874,9 +861,9 @@ class ExperimentAnalysis(Result):
                 yield ""
 
     def _write_model_blocks(self) -> Iterator[Block]:
-        """Yields a table for each mixed model: effects of the conditions on the users' forces.
+        """Yields one table per mixed model: effects of the conditions on the users' forces.
 
-        There are models only if users act in pairs, see `fit_models`.
+        Models exist only if users act in pairs (see `fit_models`).
         """
         for model in self.models:
             yield f"{model.measure} of each user, mixed model against {model.reference}"
@@ -894,10 +881,10 @@ class ExperimentAnalysis(Result):
             yield ""
 
     def _write_single_unit_block(self, unit: str) -> Iterator[Block]:
-        """Yields one table of all measures, with a column for each condition.
+        """Yields one table of all measures, with one column per condition.
 
-        It replaces the tables of means and comparisons, because one participant or pair allows
-        no interval and no test.
+        Replaces the tables of means and comparisons, since a single participant or pair allows
+        no intervals or tests.
 
         Args:
             unit: Name of the only participant or pair.
@@ -920,10 +907,10 @@ class ExperimentAnalysis(Result):
 def _list_rows(
     results: Sequence[CompletionTime] | Sequence[CompletionComparison],
 ) -> list[dict[str, Any]]:
-    """Converts completion times, or comparisons of them, to table rows for CSV and JSON.
+    """Converts completion times or their comparisons to table rows for CSV and JSON.
 
     Returns:
-        A row per condition or comparison, with the field names as keys.
+        One row per condition or comparison, keyed by field name.
     """
     return [result._asdict() for result in results]
 
@@ -934,9 +921,9 @@ def analyse_experiment(
     *,
     exclude: Mapping[str, str] = {},
 ) -> ExperimentAnalysis:
-    """Computes the statistics of an experiment and writes them into its folder.
+    """Analyses an experiment and writes the results into its folder.
 
-    The command is `trilat experiment analyse`.
+    Equivalent to the command `trilat experiment analyse`.
 
     >>> analysis = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
     >>> near, *_ = analysis.means["completion_s"]  # doctest: +SKIP
@@ -945,12 +932,12 @@ def analyse_experiment(
 
     Args:
         folder: Folder of the experiment.
-        out: Folder for tables and figures. Default: the folder `analysis` in the experiment's
-            folder.
-        exclude: Participants or pairs whose data are left out, with the reasons.
+        out: Folder for tables and figures. By default, the subfolder `analysis` of the
+            experiment.
+        exclude: Mapping from each participant or pair to exclude to the reason.
 
     Raises:
-        UsageError: There is no experiment, no trial is finished, or an excluded participant or
+        UsageError: There is no experiment, no trial has finished, or an excluded participant or
             pair does not exist.
     """
     experiment = open_experiment(folder)
@@ -961,23 +948,22 @@ def analyse_experiment(
 
 
 class PowerOfExperiment(Result):
-    """Number of participants that an experiment needs to detect an effect of a given size.
-
-    The power is the probability that the test finds an effect that exists.
+    """Number of participants needed to detect an effect of a given size.
 
     Args:
-        d_z: Size of the effect.
+        d_z: Effect size.
         participants: Planned number of participants, or `None`.
         seed: Seed of the simulated experiments.
 
     Attributes:
-        d_z: Size of the effect: mean over standard deviation of the differences within
-            participants.
-        least: Smallest number of participants for each desired power.
-        participants: Planned number of participants. `None` if no number is planned.
-        power: Power with the planned number, computed with the noncentral t distribution.
-        simulated: Power with the planned number from simulated experiments, with its 95 %
-            interval.
+        d_z: Effect size: mean of the within-participant differences divided by their standard
+            deviation.
+        least: Mapping from desired power to the smallest number of participants.
+        participants: Planned number of participants, or `None`.
+        power: Power with the planned number of participants, computed from the noncentral t
+            distribution.
+        simulated: Power with the planned number of participants, from simulated experiments,
+            with its 95 % interval.
     """
 
     def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
@@ -1000,10 +986,10 @@ class PowerOfExperiment(Result):
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values for `trilat experiment power --json`.
+        """Returns the result as plain values for `trilat experiment power --json`.
 
-        These are the effect size, the participants needed for each statistical power, and the
-        power that the planned number of participants gives, both computed and simulated.
+        Contains the effect size, the number of participants needed for each power, and the
+        computed and simulated power for the planned number of participants.
         """
         simulated = None if self.simulated is None else self.simulated._asdict()
         least = []
@@ -1018,11 +1004,11 @@ class PowerOfExperiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat experiment power` prints.
+        """Yields the parts of the report that `trilat experiment power` prints.
 
-        A table shows how many participants are needed for each statistical power, which is the
-        probability of finding a true effect. If a number of participants is planned, a sentence
-        follows with the power that this number gives.
+        A table lists the number of participants needed for each power, the probability of
+        detecting a true effect. If a number of participants is planned, a sentence states the
+        resulting power.
         """
         yield (
             "paired comparison of two conditions, two-sided, alpha 0.05, "
@@ -1044,17 +1030,18 @@ class PowerOfExperiment(Result):
 def compute_experiment_power(
     effect: float, participants: int | None = None, *, seed: int = 1
 ) -> PowerOfExperiment:
-    """Computes the number of participants that are needed to detect an effect.
+    """Computes the number of participants needed to detect an effect.
 
-    The command is `trilat experiment power`.
+    Equivalent to the command `trilat experiment power`.
 
     >>> tn.compute_experiment_power(0.5).least[0.8]
     34
 
     Args:
-        effect: Mean over standard deviation of the differences within participants, Cohen's
-            d_z.
-        participants: Planned number of participants, whose power is computed and simulated.
+        effect: Effect size (Cohen's d_z): mean of the within-participant differences divided by
+            their standard deviation.
+        participants: Planned number of participants, for which the power is computed and
+            simulated.
         seed: Seed of the simulated experiments.
 
     Raises:
@@ -1064,13 +1051,13 @@ def compute_experiment_power(
 
 
 def _describe_mean(mean: ConditionMean) -> str:
-    """Returns a mean as text: "1.234", or "1.234 (2 missing)" if values are missing."""
+    """Formats a mean: "1.234", or "1.234 (2 missing)" if values are missing."""
     missing = f" ({mean.missing} missing)" if mean.missing else ""
     return f"{mean.mean:.4g}{missing}"
 
 
 def _list_points(rows: Sequence[Row], name: str) -> Array:
-    """Returns one point of the movement in each trial, in m, shape (K, 2).
+    """Returns one point of the movement in each of K trials, in m, shape (K, 2).
 
     Args:
         rows: The K trials.
@@ -1080,10 +1067,10 @@ def _list_points(rows: Sequence[Row], name: str) -> Array:
 
 
 def _format_interval(interval: tuple[float, float | None] | None) -> str:
-    """Returns a confidence interval as text, for example "[3.06, 3.22]".
+    """Formats a confidence interval, for example as "[3.06, 3.22]".
 
-    An upper end of `None` lies beyond the time limit, and is written as `NOT_REACHED`. Without
-    an interval, the text is "-".
+    An upper end of `None` lies beyond the time limit and is written as `NOT_REACHED`. If there
+    is no interval, the result is "-".
     """
     if interval is None:
         return "-"
@@ -1093,9 +1080,9 @@ def _format_interval(interval: tuple[float, float | None] | None) -> str:
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yields the names and values of the columns of a CSV row, which has no nested values.
+    """Yields the column names and values of a CSV row, flattening nested values.
 
-    A confidence interval, for example, becomes two columns such as "interval_low".
+    For example, a confidence interval becomes two columns such as "interval_low".
     """
     for key, value in row.items():
         if key in ("interval", "bootstrap"):

@@ -1,14 +1,13 @@
-"""Runs an experiment and keeps its results in a folder: logs, journals and tables.
+"""Runs an experiment and stores its results in a folder: logs, journals and tables.
 
 `Experiment.begin` creates the folder. `Experiment.run` runs the remaining trials with synthetic
-participants, which are models of people. `trilat experiment run --live` runs them with people.
-A journal is a file to which each finished trial is appended, so that an interrupted experiment
-can be continued.
+participants, which are models of people; `trilat experiment run --live` runs them with people.
+Each finished trial is appended to a journal file, so an interrupted experiment can be resumed.
 
 Invariant:
     - A folder belongs to the plan whose digest it contains.
-    - A trial in the journal is never run again, and an interrupted trial is repeated as a
-      whole. Nothing is stored twice or lost, whenever the process was killed.
+    - A trial in the journal is never run again, and an interrupted trial is repeated in full.
+      Nothing is stored twice or lost, even if the process is killed.
     - The tables are computed from the journals.
     - People and synthetic participants never share a folder.
 """
@@ -30,11 +29,10 @@ from trilat_net.scenario import parse_scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
+    WorkerPool,
     Workers,
-    build_resume_hint,
     encode_csv,
     ignore_progress,
-    open_worker_pool,
 )
 
 from .completion_times import COMPLETION, find_median, is_completed
@@ -52,22 +50,22 @@ LOGS = "logs"
 
 
 class Note(msgspec.Struct, frozen=True):
-    """An event of an experiment with people that is not a finished trial.
+    """A journal entry of an experiment other than a finished trial.
 
-    The event is a consent, the answers to a questionnaire, or an aborted trial. Events are
-    stored in a journal of their own.
+    Records a consent, the answers to a questionnaire, or an aborted trial. Notes have a journal
+    of their own.
 
     Attributes:
-        cell: Unique key of the event. It names the step of the experiment and the participant,
-            or the aborted trial.
+        cell: Unique key of the note, composed of the step of the experiment and the
+            participant, or of the aborted trial.
         kind: "consent", "questionnaire" or "aborted".
-        who: Pseudonym of the participant. If a trial was aborted, the pseudonyms of all its
+        who: Pseudonym of the participant. For an aborted trial, the pseudonyms of all its
             participants.
-        number: Number of the trial to which the event belongs.
-        unix_s: Time on the machine's clock, in s.
-        text: Name of a questionnaire, or the reason why a trial was aborted.
-        answers: Answers by item. A missing answer is `None`.
-        seed: Always 0. The field exists because journal entries of other studies have a seed.
+        number: Number of the trial to which the note belongs.
+        unix_s: Time of day on this machine's clock, in s since 1970.
+        text: Name of the questionnaire, or the reason why the trial was aborted.
+        answers: Mapping from item to answer; `None` for a missing answer.
+        seed: Always 0. Present because journal entries of other studies have a seed.
     """
 
     cell: str
@@ -95,9 +93,9 @@ class _ExperimentStatus(NamedTuple):
 
 
 class Experiment(Result):
-    """An experiment in its folder: the plan, the trials that were run, and their results.
+    """An experiment stored in a folder: the plan, the finished trials and their results.
 
-    `Experiment.begin` and `open_experiment` create this object.
+    Created by `Experiment.begin` or `open_experiment`.
 
     Args:
         folder: Folder with the plan, journals and logs of the experiment.
@@ -106,24 +104,24 @@ class Experiment(Result):
     Attributes:
         folder: Folder with the plan, journals and logs of the experiment.
         plan: The protocol and its trials.
-        unit: "pair" if two participants take part together, otherwise "participant".
+        unit: "pair" if participants take part in pairs, otherwise "participant".
     """
 
     def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
         self.folder = folder
         self.plan = plan
         self.unit = "pair" if len(plan.protocol.users) > 1 else "participant"
-        self._remedy = build_resume_hint("experiment", "run", str(folder))
+        self._remedy = RunJournal.build_resume_hint("experiment", "run", str(folder))
 
     def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
-        """Opens the journal with the results of the finished trials.
+        """Opens the journal of finished trials.
 
-        An experiment must not mix trials of people with trials of synthetic participants, which
-        are models of people. Therefore, a caller that adds trials must declare their kind here.
+        An experiment must not mix trials of people with trials of synthetic participants, so a
+        caller that adds trials must declare their kind.
 
         Args:
-            people: True to add trials of people, False to add trials of synthetic participants.
-                `None` to read only.
+            people: True to add trials of people, False to add trials of synthetic participants,
+                or `None` to open the journal for reading only.
 
         Raises:
             UsageError: The finished trials are of the other kind.
@@ -144,27 +142,24 @@ class Experiment(Result):
         )
 
     def open_notes(self) -> RunJournal[Note]:
-        """Opens the journal file of all events of the experiment that are not finished trials.
+        """Opens the journal of consents, questionnaire answers and aborted trials.
 
-        The events are consents, answers to questionnaires, and aborted trials. Use the returned
-        journal in a `with` statement to read events or to append new events.
+        Use the journal in a `with` statement to read or append notes.
         """
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
-        """Returns the results of the finished trials, by their numbers in the plan.
+        """Returns a mapping from trial number in the plan to the result of each finished trial.
 
-        Example: {1: TrialEntry(...), 2: TrialEntry(...)}. The mapping is empty before the first
-        trial.
+        For example, {1: TrialEntry(...), 2: TrialEntry(...)}. Empty before the first trial.
         """
         with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns all entries of the journal of events, in order of time.
+        """Returns all notes of the experiment in chronological order.
 
-        Each entry is a consent, the answers to a questionnaire, or a trial that was aborted.
-        The list is empty if nothing has been recorded yet.
+        A note records a consent, the answers to a questionnaire, or an aborted trial.
         """
         if not (self.folder / NOTES_FILE).exists():
             return []
@@ -172,14 +167,14 @@ class Experiment(Result):
             return list(journal.done.values())
 
     def list_choices(self) -> Choices:
-        """Returns the choices of participants in the perception test of the experiment.
+        """Returns the participants' choices in the perception test of the experiment.
 
-        A staircase presents pairs of trials, and asks in which one the quantity was larger. The
-        choices determine the difference in the next pair.
+        A staircase presents pairs of trials and asks in which of the two a quantity was larger.
+        The choices determine the difference in the next pair.
 
         Returns:
-            The chosen trial, 1 or 2, by the number of the second trial of the pair. Empty
-            without a staircase, and for pairs without an answer.
+            Mapping from the number of the second trial of a pair to the chosen trial, 1 or 2.
+            Empty if there is no staircase. Pairs with no answer are missing.
         """
         if self.plan.protocol.staircase is None:
             return {}
@@ -234,10 +229,9 @@ class Experiment(Result):
                 notes.add(note)
 
     def status(self) -> _ExperimentStatus:
-        """Returns the progress of the experiment: the finished trials, and the next trial.
+        """Returns the progress of the experiment: the finished trials and the next trial.
 
-        The progress is read from the journal on disk, so another process may be running the
-        experiment.
+        Reads the journal from disk, so the experiment may be running in another process.
         """
         done = self.read_entries()
         remaining = [trial for trial in self.plan.trials if trial.number not in done]
@@ -247,15 +241,15 @@ class Experiment(Result):
     def run(
         self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
     ) -> "Experiment":
-        """Runs the remaining trials of the experiment with simulated people.
+        """Runs the remaining trials with synthetic participants and writes the result tables.
 
-        A simulated person, or synthetic participant, is a model that moves the arms like a
-        person. The trials run in virtual time. Trials that are in the journal already are not
-        repeated. Finally, the tables of the experiment are written.
+        A synthetic participant is a model of a person who moves the arms. The trials run in
+        virtual time. Trials already in the journal are skipped.
 
         Args:
-            jobs: Number of processes. If `None`, there is one process per core.
-            show: Function that is called with the numbers of finished and of all trials.
+            jobs: Number of processes. If `None`, one process per core.
+            show: Function that is called with the number of finished trials and the total
+                number.
             on: Address of a Dask scheduler, or an executor that runs the trials. If `None`,
                 they run in processes on this machine.
 
@@ -276,7 +270,7 @@ class Experiment(Result):
                     tasks.append((plan.protocol, text, trial, plan.digest, logs))
 
             most_workers = len(tasks) or 1
-            with open_worker_pool(jobs, on, most=most_workers, hint=self._remedy) as pool:
+            with WorkerPool.open(jobs, on, most=most_workers, hint=self._remedy) as pool:
                 journal.run_pending(
                     pool,
                     SyntheticTrial.run_task,
@@ -290,9 +284,9 @@ class Experiment(Result):
         return self
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the finished trials of the experiment, in the order of the plan.
+        """Returns a table of the finished trials, in the order of the plan.
 
-        A row contains the participants, the condition and the measures of one trial.
+        Each row contains the participants, the condition and the measures of one trial.
         """
         finished_trials = self.read_entries()
         choices = self.list_choices()
@@ -353,9 +347,9 @@ class Experiment(Result):
         return {"difference": difference, "right": right}
 
     def list_answers(self) -> list[dict[str, Any]]:
-        """Returns the participants' answers, one row per item of each questionnaire.
+        """Returns the questionnaire answers as a table, with one row per item.
 
-        The file questionnaires.csv has these rows. The value of a missing answer is `None`.
+        These are the rows of questionnaires.csv. Missing answers are `None`.
         """
         rows: list[dict[str, Any]] = []
         for columns, note in self._read_answer_notes():
@@ -373,8 +367,8 @@ class Experiment(Result):
     def list_scores(self) -> list[dict[str, Any]]:
         """Returns the scores of the completed questionnaires, one row per questionnaire.
 
-        The column of the score has the name of the questionnaire. A score is `None` if an
-        answer is missing.
+        The column of the score is named after the questionnaire. A score is `None` if an answer
+        is missing.
         """
         forms = {form.name: form.find_form() for form in self.plan.protocol.questionnaires}
         rows: list[dict[str, Any]] = []
@@ -410,12 +404,12 @@ class Experiment(Result):
     def write_tables(self) -> Path:
         """Writes the results as CSV tables into the folder of the experiment.
 
-        The file trials.csv has a row for each trial, with the digest of its log. An experiment
-        with people also has the files questionnaires.csv, and events.csv with the consents and
-        the aborted trials.
+        trials.csv has one row per trial, including the digest of its log. For an experiment
+        with people, also writes questionnaires.csv, and events.csv with consents and aborted
+        trials.
 
         Returns:
-            The path of trials.csv.
+            Path of trials.csv.
         """
         events = []
         for note in self.read_notes():
@@ -441,10 +435,9 @@ class Experiment(Result):
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the progress of the experiment as plain values, for JSON.
+        """Returns the progress as plain values for `trilat experiment status --json`.
 
-        `trilat experiment status --json` prints them. "trials" is the number of planned trials,
-        and "done" the number of finished trials.
+        "trials" is the number of planned trials, and "done" is the number of finished trials.
         """
         status = self.status()
         protocol = self.plan.protocol
@@ -459,10 +452,10 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the text about the progress of the experiment, with a table of the conditions.
+        """Yields the progress report of the experiment, with a table of the conditions.
 
-        The table states the median completion time of each condition, in which a trial that was
-        not completed counts as longer than any other.
+        The table contains the median completion time of each condition. Trials that were not
+        completed count as longer than all others.
         """
         status = self.status()
         counted_rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
@@ -490,14 +483,14 @@ class Experiment(Result):
 
     @classmethod
     def begin(cls, file: str | Path, out: str | Path | None = None) -> "Experiment":
-        """Creates the folder of a new experiment, by default runs/experiment-NAME-N.
+        """Creates the folder of a new experiment.
 
-        The folder contains the protocol, and the plan of all trials with their scenarios as
+        The folder contains the protocol and the plan of all trials, with their scenarios, as
         JSON.
 
         Args:
             file: File of the protocol.
-            out: The folder. If `None`, it is the next free runs/experiment-NAME-N.
+            out: The folder. If `None`, the next free runs/experiment-NAME-N.
         """
         plan = check_experiment(file)
         default_name = f"experiment-{plan.protocol.name}"
@@ -516,9 +509,10 @@ class Experiment(Result):
         return cls(folder, plan)
 
     def list_log_problems(self) -> Iterator[str]:
-        """Yields a sentence for each finished trial whose log is missing or was changed.
+        """Yields a sentence for each finished trial whose log is missing or has been modified.
 
-        A log proves what happened in its trial. The journal contains the checksum of each log.
+        Logs are the evidence of what happened in a trial, and the journal contains their
+        checksums.
         """
         finished_trials = self.read_entries()
         for planned in self.plan.trials:
@@ -559,18 +553,18 @@ def _describe_median(rows: list[dict[str, Any]]) -> str:
 
 
 def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
-    """Writes a protocol with comments, ready to run, as `trilat experiment new` does.
+    """Writes a commented protocol that is ready to run, as `trilat experiment new` does.
 
     >>> tn.new_experiment("reaching.toml").name
     'reaching.toml'
 
     Args:
         file: Path of the protocol.
-        pair: True if two people each hold a master, False if one person does.
-        force: True to replace an existing file.
+        pair: True for a protocol in which two people each hold a master arm.
+        force: True to overwrite an existing file.
 
     Raises:
-        UsageError: The file exists.
+        UsageError: The file already exists.
     """
     template_name = "experiment_pair.txt" if pair else "experiment.txt"
     template = resources.files(__package__) / template_name
@@ -579,9 +573,9 @@ def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False)
 
 
 def check_experiment(file: str | Path) -> ExperimentPlan:
-    """Checks the protocol of an experiment with people, and plans all of its trials.
+    """Validates the protocol of an experiment with people and plans its trials.
 
-    The command is `trilat experiment check`.
+    Equivalent to the command `trilat experiment check`.
 
     >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
     240
@@ -591,7 +585,7 @@ def check_experiment(file: str | Path) -> ExperimentPlan:
             of participants and trials.
 
     Returns:
-        The plan, which lists every trial in its order.
+        The plan, which lists all trials in the order in which they are run.
 
     Raises:
         UsageError: The protocol cannot be carried out. The error lists all problems.
@@ -645,14 +639,16 @@ def run_experiment(
     >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP
 
     Args:
-        source: File of a protocol, or the folder of an experiment to continue.
-        out: Folder of the experiment. Default: the next free runs/experiment-NAME-N.
-        jobs: Number of processes. If `None`, there is one per core.
+        source: File of a protocol, or folder of an experiment to resume.
+        out: Folder of the experiment. By default, the next free runs/experiment-NAME-N.
+        jobs: Number of processes. If `None`, one per core.
         on: Address of a Dask scheduler, or an executor that runs the trials.
-        progress: Function that is called with the numbers of finished and of all trials.
+        progress: Function that is called with the number of finished trials and the total
+            number.
 
     Raises:
-        UsageError: The protocol cannot be carried out, or the folder contains something else.
+        UsageError: The protocol cannot be carried out, or the folder contains something other
+            than an experiment.
     """
     if Path(source).is_dir():
         experiment = open_experiment(source)

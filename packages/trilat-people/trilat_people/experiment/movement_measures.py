@@ -1,7 +1,7 @@
-"""Computes measures of human movement and cooperation, each by a published definition.
+"""Measures of human movement and cooperation, each with a published definition.
 
-A measure takes arrays of samples that are equally spaced in time, with a row for each sample,
-and returns a number. All quantities are in SI units.
+A measure takes arrays of samples that are equally spaced in time, with one row per sample, and
+returns a number. All quantities are in SI units.
 
 | measure | function |
 |---|---|
@@ -13,9 +13,9 @@ and returns a number. All quantities are in SI units.
 
 Invariant:
     - A measure depends only on its samples.
-    - A measure that the samples do not determine is `None`, for example the smoothness of an
-      arm at rest, or the effective width of end points that all coincide.
-    - Arrays of different shapes, and answers outside their scale, are errors.
+    - A measure is `None` if it is undefined for the samples, for example the smoothness of an
+      arm at rest, or the effective width of coincident end points.
+    - Arrays of different shapes and answers outside their scale raise an error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -106,20 +106,21 @@ def sparc(
     cutoff_hz: float = 10.0,
     threshold: float = 0.05,
 ) -> float | None:
-    """Computes the spectral arc length of a movement (SPARC), a measure of its smoothness.
+    """Computes the spectral arc length (SPARC), a measure of the smoothness of a movement.
 
-    The value is negative. A value closer to 0 means a smoother movement. The speed spectrum of
-    a movement that is not smooth has many bumps, which make its curve long.
+    The value is negative, and closer to 0 for a smoother movement. An unsmooth movement has a
+    bumpy speed spectrum, whose curve is long.
 
     Args:
-        speed: Speed of a movement from its start to its end, in m/s or rad/s, shape (K,).
-        rate_hz: Samples per second.
-        padding: The samples are padded with zeros to 2^padding times the next power of two.
-        cutoff_hz: Frequencies above this value count as noise.
-        threshold: Share of the largest magnitude below which the spectrum ends.
+        speed: Speed from the start to the end of the movement, in m/s or rad/s, shape (K,).
+        rate_hz: Sample rate, in Hz.
+        padding: Zero-padding exponent: the samples are padded to 2^padding times the next power
+            of two.
+        cutoff_hz: Frequency, in Hz, above which the spectrum is treated as noise.
+        threshold: Fraction of the largest magnitude below which the spectrum is cut off.
 
     Returns:
-        The spectral arc length. `None` if there was no movement.
+        The spectral arc length, or `None` if there was no movement.
 
     Source: Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, "On the analysis of
     movement smoothness", J. NeuroEngineering and Rehabilitation 12:112 (2015).
@@ -156,9 +157,10 @@ def sparc(
 
 
 def path_length_m(places: ArrayLike) -> float:
-    """Computes the length of a sampled path, in m, as the sum of its straight segments.
+    """Computes the length of a sampled path, in m.
 
-    A detour or a tremor makes the path longer than the distance between its ends.
+    Sums the lengths of the straight segments between samples, so detours and tremor increase
+    the result.
 
     Args:
         places: Positions along the path, in m, shape (K, D).
@@ -179,11 +181,11 @@ def movement_time_s(
 
     Args:
         speed: Speed, in m/s or rad/s, shape (K,).
-        rate_hz: Samples per second.
+        rate_hz: Sample rate, in Hz.
         share: Fraction of the peak speed at which the movement starts and ends.
 
     Returns:
-        The duration. `None` if there was no movement.
+        The duration, or `None` if there was no movement.
     """
     samples = np.abs(_read("speed", speed, 1))
     if not samples.any():
@@ -195,14 +197,14 @@ def movement_time_s(
 
 
 def energy_j(force: ArrayLike, velocity: ArrayLike, rate_hz: float) -> float:
-    """Computes the work of a force on a moving body, in J.
+    """Computes the work done by a force on a moving body, in J.
 
-    The work is the integral of f'v over time, where f is the force and v the velocity.
+    The work is the time integral of f'v, where f is the force and v is the velocity.
 
     Args:
         force: Force on the body, in N, shape (K, D).
-        velocity: Velocity of the body, in m/s, of the same shape.
-        rate_hz: Samples per second.
+        velocity: Velocity of the body, in m/s, same shape as `force`.
+        rate_hz: Sample rate, in Hz.
     """
     forces, velocities = _read_same_shape(force=force, velocity=velocity)
     power = (forces * velocities).sum(axis=1)
@@ -221,14 +223,13 @@ A range of this width holds 96 % of normally distributed end points.
 class Throughput(NamedTuple):
     """Throughput of a sequence of movements to targets of equal distance and width.
 
-    The throughput combines the speed and the accuracy of aimed movements in one number.
+    Throughput is a combined measure of the speed and accuracy of aimed movements.
 
     Args:
-        width_m: Effective width, 4.133 standard deviations of the end points along the axis of
-            the task, in m.
-        distance_m: Effective distance, the mean distance moved along the axis of the task, in
-            m.
-        difficulty_bits: Index of difficulty, log2(distance / width + 1), in bit.
+        width_m: Effective width: 4.133 standard deviations of the end points along the task
+            axis, in m.
+        distance_m: Effective distance: mean distance moved along the task axis, in m.
+        difficulty_bits: Index of difficulty, log2(distance / width + 1), in bits.
         time_s: Mean movement time, in s.
     """
 
@@ -239,9 +240,9 @@ class Throughput(NamedTuple):
 
     @property
     def bits_s(self) -> float:
-        """Throughput of pointing movements in bit/s, as Fitts's law defines it.
+        """Throughput in bit/s, as defined by Fitts's law.
 
-        The throughput is the index of difficulty divided by the mean movement time.
+        The index of difficulty divided by the mean movement time.
         """
         return self.difficulty_bits / self.time_s
 
@@ -254,24 +255,24 @@ def measure_throughput(
     *,
     serial: bool = False,
 ) -> Throughput | None:
-    """Computes the throughput of aimed movements: their speed and accuracy in one number.
+    """Computes the throughput of aimed movements, which combines speed and accuracy.
 
-    The throughput is log2(distance / width + 1) / time, in bit/s. The effective width is 4.133
-    standard deviations of the end points along the direction of the movement.
+    Throughput is log2(distance / width + 1) / time, in bit/s. The effective width is 4.133
+    standard deviations of the end points along the direction of movement.
 
     Args:
-        starts: Centres of the targets from which the movements start, in m, shape (K, D).
-        targets: Centres of the targets to reach, in m, of the same shape.
-        ends: End points of the movements, in m, of the same shape.
+        starts: Centres of the targets at which the movements start, in m, shape (K, D).
+        targets: Centres of the targets to reach, in m, same shape as `starts`.
+        ends: End points of the movements, in m, same shape as `starts`.
         times_s: Duration of each movement, in s, shape (K,).
         serial: True if each movement starts at the end point of the previous one, as around a
-            ring. The overshoot of the previous movement then adds to the distance.
+            ring. The overshoot of the previous movement is then added to the distance.
 
     Returns:
-        The throughput. `None` if all end points coincide.
+        The throughput, or `None` if all end points coincide.
 
     Source: ISO/TS 9241-411 (2012); Soukoreff and MacKenzie, "Towards a standard for pointing
-    device evaluation", Int. J. Human-Computer Studies 61 (2004). The result equals that of
+    device evaluation", Int. J. Human-Computer Studies 61 (2004). The result agrees with
     MacKenzie's class `Throughput`.
     """
     start_points, target_points, end_points = _read_same_shape(
@@ -321,19 +322,18 @@ def measure_throughput(
 
 
 def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
-    """Returns the part of two users' forces on an object that cancels out.
+    """Returns the part of two users' forces on an object that cancels out, in N.
 
-    If the two users' forces along an axis have opposite signs, the smaller force cancels an
-    equal part of the larger force. Otherwise no force cancels. The second user's part is the
-    negative of the first user's. `internal_rms_n` in docs/reference/metrics.md is the RMS of
-    this force.
+    Along an axis where the two forces have opposite signs, the smaller force cancels an equal
+    part of the larger one. Otherwise, nothing cancels. The second user's part is minus the
+    first user's. `internal_rms_n` in docs/reference/metrics.md is the RMS of this force.
 
     Args:
         first: Force of the first user on the object, in N, shape (K, D).
-        second: Force of the second user on the object, in N, of the same shape.
+        second: Force of the second user on the object, in N, same shape as `first`.
 
     Returns:
-        The first user's part, in N, shape (K, D).
+        The first user's part, shape (K, D).
 
     Source: Groten, Feth, Goshy, Peer, Kenny and Buss, "Experimental analysis of dominance in
     haptic collaboration", IEEE RO-MAN (2009).
@@ -350,20 +350,21 @@ def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 class PairMeasures(NamedTuple):
-    """Forces and work of two people who move a shared object together in a trial.
+    """Forces and work of two people who move a shared object in a trial.
 
     Args:
-        internal_rms_n: RMS of the force that cancels out, over all axes and samples, in N.
+        internal_rms_n: RMS of the internal force (which cancels out), over all axes and
+            samples, in N.
         useful_rms_n: RMS of the sum of both forces, which moves the object, in N.
-        internal_share: Fraction of the forces that cancels out, from 0 to 1. `None` if both
+        internal_share: Fraction of the forces that cancels out, between 0 and 1. `None` if both
             forces are zero.
-        first_effort_share: The first user's share of the integral of the squared forces. `None`
-            if both forces are zero.
-        first_work_j: Work of the first user on the object, in J.
-        second_work_j: Work of the second user on the object, in J.
-        first_taken_j: Energy that the first user absorbs, in J: the integral of the negative
+        first_effort_share: First user's share of the integral of the squared forces. `None` if
+            both forces are zero.
+        first_work_j: Work done by the first user on the object, in J.
+        second_work_j: Work done by the second user on the object, in J.
+        first_taken_j: Energy absorbed by the first user, in J: the integral of the negative
             part of the user's power.
-        second_taken_j: Energy that the second user absorbs, in J.
+        second_taken_j: Energy absorbed by the second user, in J.
     """
 
     internal_rms_n: float
@@ -379,16 +380,16 @@ class PairMeasures(NamedTuple):
 def measure_pair(
     first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_hz: float
 ) -> PairMeasures:
-    """Computes the forces and the work of two users who move a shared object together.
+    """Computes the forces and work of two users who move a shared object together.
 
-    The sum of their forces moves the object. The internal force is the part with which they
-    work against each other, and which only squeezes the object.
+    The sum of their forces moves the object. The internal force, with which they work against
+    each other, only squeezes it.
 
     Args:
         first: Force of the first user on the object, in N, shape (K, D).
-        second: Force of the second user on the object, in N, of the same shape.
-        velocity: Velocity of the object, in m/s, of the same shape.
-        rate_hz: Samples per second.
+        second: Force of the second user on the object, in N, same shape as `first`.
+        velocity: Velocity of the object, in m/s, same shape as `first`.
+        rate_hz: Sample rate, in Hz.
     """
     first_force, second_force, velocities = _read_same_shape(
         first=first, second=second, velocity=velocity
@@ -460,12 +461,12 @@ def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
 
 
 def raw_tlx(ratings: Mapping[str, float]) -> float:
-    """Returns the raw NASA Task Load Index, which measures how demanding a task was.
+    """Computes the raw NASA Task Load Index, a measure of how demanding a task was.
 
-    The index is the mean of six ratings of a participant.
+    The index is the mean of a participant's six ratings.
 
     Args:
-        ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
+        ratings: Mapping from each of `TLX_SCALES` to a rating from 0 to 100.
 
     Source: Hart, "NASA-Task Load Index (NASA-TLX); 20 years later", Proc. Human Factors and
     Ergonomics Society 50 (2006).
@@ -474,13 +475,14 @@ def raw_tlx(ratings: Mapping[str, float]) -> float:
 
 
 def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> float:
-    """Returns the weighted NASA Task Load Index, which measures how demanding a task was.
+    """Computes the weighted NASA Task Load Index, a measure of how demanding a task was.
 
-    The index is the weighted mean of six ratings of a participant.
+    The index is the weighted mean of a participant's six ratings.
 
     Args:
-        ratings: A rating from 0 to 100 for each of `TLX_SCALES`.
-        weights: How often each scale was chosen in the 15 comparisons of two scales.
+        ratings: Mapping from each of `TLX_SCALES` to a rating from 0 to 100.
+        weights: Mapping from scale to the number of times it was chosen in the 15 pairwise
+            comparisons.
 
     Source: Hart and Staveland, "Development of NASA-TLX (Task Load Index): results of empirical
     and theoretical research", Advances in Psychology 52 (1988).
@@ -505,12 +507,13 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
 
 
 def sus_score(answers: Sequence[int]) -> float:
-    """Returns a participant's rating of the usability of a system, from 0 to 100.
+    """Computes the System Usability Scale (SUS) score of a participant, from 0 to 100.
 
-    The rating is the score of the System Usability Scale (SUS), a questionnaire of ten items.
+    SUS is a questionnaire of ten items on the usability of a system.
 
     Args:
-        answers: Ten answers from 1 (strongly disagree) to 5, in the order of the questions.
+        answers: Ten answers from 1 (strongly disagree) to 5 (strongly agree), in the order of
+            the questions.
 
     Source: Brooke, "SUS: a quick and dirty usability scale", Usability Evaluation in Industry
     (1996).

@@ -1,14 +1,14 @@
-"""Reads the protocol of an experiment with people, and plans its trials.
+"""Reads the protocol of an experiment with people and plans its trials.
 
-A protocol is a TOML file. It names the scenario (the robot arms and their network), the
-conditions (keys of the scenario with different values), the task, and the number of
-participants and trials. The plan lists all trials in their order. The order of the conditions
-is balanced over the participants, so that practice and fatigue affect all conditions alike.
-Targets are drawn at random.
+A protocol is a TOML file that specifies the scenario (the robot arms and their network), the
+conditions (scenario keys whose values differ), the task, and the number of participants and
+trials. The plan lists all trials in the order in which they are run. The order of conditions is
+balanced over participants, so that practice and fatigue affect all conditions equally. Targets
+are drawn at random.
 
 Invariant:
     - The plan depends only on the protocol and on the scenarios of its conditions.
-    - The digest of the plan covers the protocol and the text of the scenario of each condition.
+    - The digest of the plan covers the protocol and the source of each condition's scenario.
       The log of each trial contains the digest, which proves that the trial follows the plan.
     - A protocol that cannot be carried out is rejected as a whole, with a list of all problems.
 """
@@ -91,11 +91,12 @@ class _Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Describes the design of the training in a sentence for the methods of a paper.
+        """Describes the design of the training in one sentence, for use in a paper.
 
-        In a training, an expert first leads the slave, and the learner gets more and more of
-        the authority. The sentence states the first and the last value of the expert's share,
-        as in "0.9 to 0.1 (guided)", and the numbers of trials before, after and for retention.
+        In a training, an expert initially leads the slave, and authority gradually passes to
+        the learner. The sentence states the first and last value of the expert's share, as in
+        "0.9 to 0.1 (guided)", and the number of trials before and after the training and for
+        retention.
         """
         courses: list[str] = []
         for condition, (first_lead, last_lead) in self.lead.items():
@@ -113,37 +114,40 @@ class _Training(Frozen, frozen=True):
 
 
 class ExperimentProtocol(Frozen, frozen=True):
-    """Plan of an experiment with people, as an experimenter writes it in a TOML file.
+    """Protocol of an experiment with people, as written by an experimenter in a TOML file.
 
-    The attributes are the keys of this file.
+    The attributes are the keys of the file.
 
     Attributes:
         name: Name of the experiment.
-        title: Title of the experiment for people.
+        title: Human-readable title of the experiment.
         scenario: Name or path of the scenario on which all conditions are based.
-        users: Names of the sites whose arms participants hold. Two sites are held by a pair.
-        participants: Number of participants, or their pseudonyms.
-        design: Method that balances the order of conditions over participants, see
-            docs/reference/experiment-protocol.md.
-        trials: Number of counted trials of a block. A block has all trials of a condition.
-        practice: Number of practice trials before the counted trials of a block.
-        foreperiod_s: Shortest and longest time from the start of a trial until its target
-            appears, in s. The time is drawn uniformly.
-        seed: Seed of orders, targets and synthetic participants.
-        set: Scenario keys with the same value in all conditions.
-        conditions: For each condition by name, the scenario keys that it sets.
+        users: Names of the sites whose arms participants hold. Two sites are operated by a
+            pair.
+        participants: Number of participants, or a list of their pseudonyms.
+        design: Method for balancing the order of conditions over participants (see
+            docs/reference/experiment-protocol.md).
+        trials: Number of counted trials per block. A block contains all trials of a condition.
+        practice: Number of practice trials at the start of each block.
+        foreperiod_s: Minimum and maximum time from the start of a trial until its target
+            appears, in s. The actual time is drawn uniformly.
+        seed: Random seed for orders, targets and synthetic participants.
+        set: Scenario keys to set in all conditions.
+        conditions: Mapping from condition name to the scenario keys that the condition sets.
         task: Task of the participants.
         model: Parameters of synthetic participants.
-        consent: Text to which people agree before their first trial. Empty to request no
-            consent.
-        questionnaires: The questionnaires, and when people answer them.
-        rest_s: Shortest rest between two blocks, in s.
-        feedback: Measures that people see after a trial.
-        force_limit_n: Largest force with which a participant can push the arm, in N, by the
-            pseudonym of each participant who needs a lower limit.
-        catch: Trials of another condition within a block. They are not evaluated.
-        training: Trials in which authority moves from an expert to a learner.
-        staircase: Pairs of trials that adapt a scenario key to a participant's threshold.
+        consent: Consent text to which people agree before their first trial. Empty if no
+            consent is requested.
+        questionnaires: Questionnaires, and when they are answered.
+        rest_s: Minimum rest between two blocks, in s.
+        feedback: Measures shown to people after a trial.
+        force_limit_n: Mapping from pseudonym to the largest force, in N, with which that
+            participant can push the arm. Only for participants who need a lower limit.
+        catch: Catch trials: trials of another condition within a block, excluded from the
+            analysis.
+        training: Trials in which authority passes from an expert to a learner.
+        staircase: Pairs of trials that adapt a scenario key to a participant's perception
+            threshold.
     """
 
     name: Name
@@ -172,21 +176,20 @@ class ExperimentProtocol(Frozen, frozen=True):
     def list_phases(
         self, condition: str, random: np.random.Generator
     ) -> list[tuple[str, float | None]]:
-        """Lists the phase and the authority of each trial of a block, without practice trials.
+        """Lists the phase and authority of each trial of a block, excluding practice trials.
 
-        A block contains all trials of a participant under one condition. In an experiment with
-        a training, the phases are "before", "training", "after" and "retention". In an
-        experiment with a staircase, trials come in pairs, and one of the two phases of a pair
-        is the standard trial.
+        A block contains all trials of a participant under one condition. With a training, the
+        phases are "before", "training", "after" and "retention". With a staircase, trials come
+        in pairs, one of which is the standard trial.
 
         Args:
             condition: Name of the condition of the block.
-            random: Generator that draws the order within the pairs of a staircase.
+            random: Generator for the order within the pairs of a staircase.
 
         Returns:
             For each trial, the phase and the first user's share of the authority over the slave
-            arm, from 0 to 1. The phase is empty without training and staircase. If the share is
-            `None`, the authority that the scenario defines is kept.
+            arm, between 0 and 1. The phase is empty if there is neither training nor staircase.
+            If the share is `None`, the authority defined in the scenario is kept.
         """
         phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
@@ -212,8 +215,8 @@ class ExperimentProtocol(Frozen, frozen=True):
     def forms(self) -> list[Questionnaire]:
         """Forms that participants fill in during the experiment.
 
-        The forms are the questionnaires. In an experiment that measures a perception threshold,
-        the question that follows each pair of trials is also a form.
+        Includes the questionnaires and, if the experiment measures a perception threshold, the
+        question asked after each pair of trials.
         """
         forms = list(self.questionnaires)
         if self.staircase:
@@ -224,8 +227,8 @@ class ExperimentProtocol(Frozen, frozen=True):
     def groups(self) -> list[tuple[str, ...]]:
         """Participants who take part together, as tuples of one or two pseudonyms.
 
-        The protocol lists pseudonyms or states a number. A number of 12 gives P01 to P12. With
-        two users in the task, consecutive participants form pairs.
+        If the protocol contains a number of participants, such as 12, the pseudonyms are P01 to
+        P12. If the task has two users, consecutive participants form pairs.
         """
         participants = self.participants
         if isinstance(participants, int):
@@ -243,10 +246,10 @@ class ExperimentProtocol(Frozen, frozen=True):
 
     @classmethod
     def read(cls, file: str | Path) -> "ExperimentProtocol":
-        """Reads the protocol of an experiment from a TOML file, without planning its trials.
+        """Reads a protocol from a TOML file, without planning its trials.
 
         Args:
-            file: Path of the file.
+            file: Path of the TOML file.
 
         Raises:
             UsageError: The file cannot be read, or a key or value in it is not valid.
@@ -266,22 +269,21 @@ class ExperimentProtocol(Frozen, frozen=True):
             raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
 
     def limit_forces(self, scenario: Scenario, group: Sequence[str]) -> dict[str, Any]:
-        """Lowers the force limits of the arms of participants who must not push hard.
+        """Lowers the force limits for participants who must not push hard.
 
-        The protocol states these participants and their limits under `force_limit_n`. The
-        result contains the changed settings of their sites (arm controllers).
+        These participants and their limits are listed in the protocol under `force_limit_n`.
 
         Args:
             scenario: Scenario of the condition.
             group: Pseudonyms of the participants.
 
         Returns:
-            The specifications of the sites whose limits change, by the name of the site. Empty
-            if no participant of the group needs a lower limit.
+            Mapping from site name to the new specification of each site whose limit changes.
+            Empty if no participant of the group needs a lower limit.
 
         Raises:
-            ScenarioError: The scenario has no force limit for this site, or already has a lower
-                limit.
+            ScenarioError: The scenario has no force limit for the site, or already has a lower
+                one.
         """
         limited_sites: dict[str, Any] = {}
         # The lengths may differ: `_find_problems` reports a group that is too small.
@@ -314,17 +316,16 @@ class ExperimentProtocol(Frozen, frozen=True):
         return limited_sites
 
     def list_orders(self) -> list[tuple[str, ...]]:
-        """Lists orders of the conditions, which are assigned to participants in turn.
+        """Lists the orders of the conditions, which are assigned to participants in turn.
 
-        Participants improve with practice and deteriorate with fatigue. If the orders of the
-        conditions differ between participants, these effects are on average the same for all
-        conditions.
+        Participants improve with practice and tire over time. Varying the order of conditions
+        between participants makes these effects equal for all conditions on average.
 
-        The design "williams" has each condition equally often at each position, and equally
-        often right after each other condition (Williams 1949); an odd number of conditions
-        needs twice as many orders. "latin" is a cyclic Latin square, which balances only the
-        positions. "random" has 1000 random permutations, drawn with the seed of the protocol.
-        "fixed" is the order of `conditions`.
+        In the design "williams", each condition occurs equally often at each position and
+        equally often directly after each other condition (Williams 1949); an odd number of
+        conditions requires twice as many orders. "latin" is a cyclic Latin square, which
+        balances only the positions. "random" uses 1000 random permutations drawn with the seed
+        of the protocol. "fixed" is the order of `conditions`.
         """
         conditions = list(self.conditions)
         count = len(conditions)
@@ -360,25 +361,25 @@ class ExperimentProtocol(Frozen, frozen=True):
 
 
 class PlannedTrial(NamedTuple):
-    """One trial of an experiment, with its participants, condition and place in the order.
+    """One trial in the plan of an experiment, with its participants and condition.
 
     Attributes:
-        number: Number of the trial in the experiment, from 1.
+        number: Number of the trial in the experiment, starting at 1.
         group: Pseudonyms of the participants, in the order of the protocol's users.
         condition: Name of the condition.
-        block: Number of the block within the group, from 1.
-        trial: Number of the trial within the block, from 1. Practice trials are first.
-        practice: True for a practice trial, which is not evaluated.
-        before: Number of earlier trials of the group.
-        target: Number of the target. The first target of each block is drawn, so that effects
-            of the target's direction are not mistaken for learning. Both trials of a staircase
-            pair have the same target.
-        seed: Seed of the random numbers of the trial.
-        catch: True for a catch trial, whose condition differs from that of its block, and which
-            is not evaluated.
-        phase: Phase of a training: "before", "training", "after" or "retention". In a
-            staircase: "standard" or "comparison". Otherwise empty.
-        lead: The first user's share of the authority that two users have over the slave. If
+        block: Number of the block within the group, starting at 1.
+        trial: Number of the trial within the block, starting at 1. Practice trials come first.
+        practice: True for a practice trial, which is excluded from the analysis.
+        before: Number of trials that the group has done before.
+        target: Number of the target. The first target of each block is drawn at random, so that
+            an effect of target direction is not mistaken for learning. Both trials of a
+            staircase pair have the same target.
+        seed: Random seed of the trial.
+        catch: True for a catch trial, whose condition differs from that of its block. Excluded
+            from the analysis.
+        phase: "before", "training", "after" or "retention" in a training; "standard" or
+            "comparison" in a staircase; otherwise empty.
+        lead: First user's share of the authority that both users have over the slave. If
             `None`, the scenario's dominance factors are kept.
     """
 
@@ -397,9 +398,9 @@ class PlannedTrial(NamedTuple):
 
     @property
     def file(self) -> str:
-        """Name of the file with the trial's log: number, participants, block, trial, condition.
+        """Name of the trial's log file, for example "00017-P01-P02-b1-t03-near.mcap".
 
-        Example: "00017-P01-P02-b1-t03-near.mcap".
+        Composed of number, participants, block, trial and condition.
         """
         group = "-".join(self.group)
         position = f"b{self.block}-t{self.trial:02d}"
@@ -411,15 +412,13 @@ Choices = Mapping[int, float]
 
 
 class Step(NamedTuple):
-    """A step of an experiment that participants have to complete.
-
-    In a step, participants give consent, do a trial, or answer a questionnaire.
+    """A step that participants of an experiment complete: a consent, trial or questionnaire.
 
     Attributes:
         kind: "consent", "trial" or "questionnaire".
-        planned: The trial of the step. For a consent it is the next trial, and for a
-            questionnaire the previous trial.
-        form: The questionnaire. `None` for other kinds.
+        planned: The trial of the step. For a consent, the next trial; for a questionnaire, the
+            previous one.
+        form: The questionnaire, or `None` for other kinds.
     """
 
     kind: Literal["consent", "trial", "questionnaire"]
@@ -428,10 +427,10 @@ class Step(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Identifier of the step, by which notes in the journal and messages refer to it.
+        """Identifier of the step in journal notes and messages.
 
-        It consists of the kind, the number of the trial and, for a questionnaire, its name:
-        "trial 17", "questionnaire 24 tlx".
+        Composed of the kind, the number of the trial and, for a questionnaire, its name, as in
+        "trial 17" or "questionnaire 24 tlx".
         """
         key = f"{self.kind} {self.planned.number}"
         if self.form is not None:
@@ -441,15 +440,15 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class ExperimentPlan(Result):
-    """An experiment that is ready to run: its protocol and all trials in their order.
+    """Plan of an experiment that is ready to run: its protocol and all of its trials.
 
-    `of_protocol` creates this object from a protocol.
+    Created from a protocol by `of_protocol`.
 
     Attributes:
         protocol: Design of the experiment: conditions, task and participants.
-        scenarios: Scenario of each condition, by name.
-        trials: All trials in their order.
-        digest: SHA-256 of protocol and scenarios, in hexadecimal digits.
+        scenarios: Mapping from condition name to scenario.
+        trials: All trials, in the order in which they are run.
+        digest: SHA-256 hash of the protocol and scenarios, in hexadecimal.
     """
 
     protocol: ExperimentProtocol
@@ -458,13 +457,10 @@ class ExperimentPlan(Result):
     digest: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Summarises the planned trials of an experiment as plain values, for JSON.
+        """Summarises the plan as plain values, as printed by `trilat experiment check --json`.
 
-        `trilat experiment check --json` prints them.
-
-        Returns:
-            Counts, conditions, and the order of the conditions for each group, ready for JSON.
-            "counted" is the number of trials that are neither for practice nor catch trials.
+        Contains counts, conditions, and the order of conditions for each group. "counted" is
+        the number of trials excluding practice and catch trials.
         """
         protocol = self.protocol
         uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
@@ -479,18 +475,15 @@ class ExperimentPlan(Result):
         }
 
     def list_steps(self) -> Iterator[Step]:
-        """Yields everything that participants have to do, in the order of the experiment.
+        """Yields everything that participants have to do, group by group.
 
-        A group of participants does one block of trials for each condition. Its steps are:
+        A group does one block of trials per condition. Its steps are:
 
         - the consent, before its first trial;
         - all trials;
         - in an experiment with a staircase, the choice between the two trials of a pair, after
-          each pair. Practice trials form no pairs;
-        - questionnaires: after every block, or only after the last block of the group.
-
-        Yields:
-            The steps of all groups, one group after the other.
+          each pair (practice trials do not form pairs);
+        - questionnaires, after every block or only after the last block of the group.
         """
         protocol = self.protocol
         trials_per_block = self.trials[-1].trial
@@ -513,20 +506,21 @@ class ExperimentPlan(Result):
                         yield Step("questionnaire", planned, questionnaire.find_form())
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
-        """Judges whether the answers of the participants in a perception test were right.
+        """Determines whether participants' answers in a perception test were right.
 
-        In each pair of trials, a quantity such as the delay has its standard value in one
-        trial, and a larger value in the comparison trial. After the pair, the participants
-        choose one of the two trials. The choice of the comparison trial is right.
+        In each pair of trials, a quantity such as the delay has its standard value in one trial
+        and a larger value in the other (the comparison trial). The participants then choose one
+        of the two. Choosing the comparison trial is right.
 
         Args:
             planned: Any trial of the block, which contains all trials of the participants under
                 one condition.
-            choices: The choices 1 (first trial) or 2 (second trial), by the number of the
-                second trial of the pair.
+            choices: Mapping from the number of the second trial of a pair to the choice, 1
+                (first trial) or 2 (second trial).
 
         Returns:
-            For each choice in the block, in the order of the trials, True if it is right.
+            One entry per choice in the block, in the order of the trials: True if the choice is
+                right.
         """
         # Both numbers start at 1, so the difference is the index of the first trial.
         block_start = planned.number - planned.trial
@@ -542,18 +536,18 @@ class ExperimentPlan(Result):
         return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
-        """Returns the difference of a pair of trials in a perception test, and the answer.
+        """Returns the difference within a pair of trials in a perception test, and the answer.
 
-        A staircase presents pairs of trials that differ in one key of the scenario, and the
-        participant chooses the trial in which the value was larger.
+        A staircase presents pairs of trials that differ in one scenario key, and the
+        participant chooses the trial in which its value was larger.
 
         Args:
             planned: A trial of the pair.
             choices: Choices of the participants.
 
         Returns:
-            The difference between both trials, in the unit of the staircase's key; and True if
-            the participant's choice was right, False if it was wrong, and `None` before the
+            The difference between the two trials, in the unit of the staircase key; and True if
+            the participant's choice was right, False if it was wrong, or `None` before the
             choice.
         """
         staircase = self.protocol.staircase
@@ -568,14 +562,14 @@ class ExperimentPlan(Result):
         return differences[pair_index], is_right
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
-        """Returns the scenario that is run in a trial.
+        """Returns the scenario for a trial.
 
-        This is the scenario of the trial's condition. In a perception test (staircase), a key
-        of the scenario is adapted to the earlier choices of the participant.
+        This is the scenario of the trial's condition. In a perception test (staircase), one key
+        is adapted to the participant's earlier choices.
 
         Args:
-            planned: The trial in the plan.
-            choices: Choices that participants have made so far.
+            planned: The planned trial.
+            choices: Choices that the participants have made so far.
         """
         scenario = self.scenarios[planned.condition]
         staircase = self.protocol.staircase
@@ -589,13 +583,13 @@ class ExperimentPlan(Result):
         return load_scenario(scenario, {staircase.key: value})
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
-        """Returns the shortest rest of the participants before a trial, in s.
+        """Returns the minimum rest of the participants before a trial, in s.
 
-        The rest precedes the first trial of each later block, and the retention test of a
-        training. It is 0 before all other trials.
+        Participants rest before the first trial of each block but the first, and before the
+        retention test of a training. The rest is 0 before all other trials.
 
         Args:
-            planned: The trial in the plan.
+            planned: The planned trial.
         """
         training = self.protocol.training
         # Numbers start at 1, so the previous trial has the index `number` - 2.
@@ -611,14 +605,13 @@ class ExperimentPlan(Result):
         return 0.0
 
     def list_orders(self) -> dict[str, list[str]]:
-        """Returns the order in which each group of participants gets the conditions.
+        """Returns the order of conditions for each group of participants.
 
-        Participants improve with practice. Therefore, the order of the conditions differs
-        between the groups.
+        The order differs between groups because participants improve with practice.
 
         Returns:
-            Names of the conditions in order, by the name of the group, for example {"P01-P02":
-            ["near", "far"]}.
+            Mapping from group name to the ordered names of the conditions, for example
+            {"P01-P02": ["near", "far"]}.
         """
         orders: dict[str, list[str]] = {}
         for trial in self.trials:
@@ -631,10 +624,10 @@ class ExperimentPlan(Result):
         return orders
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat experiment check` prints.
+        """Yields the parts of the report that `trilat experiment check` prints.
 
-        The text tells the experimenter, before any person is invited, the number of trials, the
-        longest duration of each, and the order in which each group gets the conditions.
+        The report states the number of trials, the maximum duration of each, and the order of
+        conditions for each group.
         """
         protocol = self.protocol
         facts = self.to_dict()
@@ -665,16 +658,16 @@ class ExperimentPlan(Result):
         folder: Path | None = None,
         scenarios: Mapping[str, Scenario] | None = None,
     ) -> "ExperimentPlan":
-        """Plans all trials of an experiment from its protocol, or rejects the protocol.
+        """Plans all trials of an experiment.
 
-        The protocol is the design of the experiment. The same protocol always gives the same
-        plan, so the plan can be published before the experiment.
+        The same protocol always gives the same plan, so the plan can be published before the
+        experiment.
 
         Args:
             protocol: Design of the experiment: conditions, task and participants.
             folder: Folder to which the path of the protocol's scenario is relative.
-            scenarios: Scenario of each condition. If `None`, they are loaded from the
-                protocol's scenario.
+            scenarios: Mapping from condition name to scenario. If `None`, the scenarios are
+                loaded as specified in the protocol.
 
         Raises:
             UsageError: The protocol cannot be carried out. The error lists all problems.

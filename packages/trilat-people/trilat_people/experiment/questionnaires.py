@@ -1,11 +1,12 @@
-"""Defines questionnaires that people answer on the page of an experiment.
+"""Questionnaires that people answer on the page of an experiment.
 
-NASA-TLX (workload), SUS (usability) and a questionnaire on the sense of agency ship with
-trilat-net. A protocol may define others.
+NASA-TLX (workload), SUS (usability) and a questionnaire on the sense of agency are built in. A
+protocol may define others.
 
 Invariant:
-    - An answer is a number on the questionnaire's scale, or `None`. Anything else is rejected.
-    - `None` represents an item without an answer, such as a slider that nobody touched. It is
+    - An answer is a number on the scale of the questionnaire, or `None`. Anything else is
+      rejected.
+    - `None` represents an unanswered item, such as a slider that was never touched. It is
       stored and counted as missing.
     - A questionnaire with a missing answer has no score.
 """
@@ -36,23 +37,23 @@ Answers = Mapping[str, float | None]
 
 
 class Questionnaire(Frozen, frozen=True):
-    """A questionnaire that participants of an experiment answer on a web page.
+    """A questionnaire that participants answer on a web page.
 
-    A shipped questionnaire, such as the NASA Task Load Index, needs only its name.
+    For a built-in questionnaire, such as the NASA Task Load Index, the name alone is
+    sufficient.
 
     Attributes:
-        name: Name of a shipped questionnaire (`tlx`, `sus`, `agency`), or another name.
-        after: "block" if people answer after each block, "experiment" if they answer once after
-            the last block.
+        name: Name of a built-in questionnaire (`tlx`, `sus`, `agency`), or any other name.
+        after: "block" to ask after each block, or "experiment" to ask once, after the last
+            block.
         title: Heading of the form.
-        items: Texts of the rated items, by their names in the table.
-        low: Text at the lower end of the scale.
-        high: Text at the upper end of the scale.
-        ends: Texts at both ends of the scale, for items whose texts differ from `low` and
-            `high`.
-        least: Smallest number of the scale.
-        most: Largest number of the scale.
-        step: Distance between two numbers of the scale.
+        items: Mapping from item name (as used in the result table) to the text of the item.
+        low: Label of the lower end of the scale.
+        high: Label of the upper end of the scale.
+        ends: Labels of both ends of the scale, for items that do not use `low` and `high`.
+        least: Smallest value of the scale.
+        most: Largest value of the scale.
+        step: Step between two values of the scale.
     """
 
     name: Name
@@ -68,24 +69,24 @@ class Questionnaire(Frozen, frozen=True):
 
     @property
     def is_forced(self) -> bool:
-        """True if a participant must answer every item, as in a perception test.
+        """True if every item must be answered, as in a perception test.
 
-        In other questionnaires, an item may be left out.
+        Items of other questionnaires may be left unanswered.
         """
         return self.name == CHOICE
 
     def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
-        """Checks a participant's answers from a web page, and assigns them to the questions.
+        """Validates a participant's answers from a web page.
 
         Args:
-            values: Answers in the order of the items. A missing answer is `None`.
+            values: Answers in the order of the items; `None` for a missing answer.
 
         Returns:
-            The answers by the names of the items. A missing answer is `None`.
+            Mapping from item name to answer; `None` for a missing answer.
 
         Raises:
-            UsageError: There are more or fewer values than items, a value is not on the scale,
-                or a required answer is missing.
+            UsageError: The number of values differs from the number of items, a value is not on
+                the scale, or a required answer is missing.
         """
         are_valid = all(self._is_valid(value) for value in values)
         if len(values) != len(self.items) or not are_valid:
@@ -107,15 +108,14 @@ class Questionnaire(Frozen, frozen=True):
         return value in range(self.least, self.most + 1, self.step)
 
     def score(self, answers: Answers) -> float | None:
-        """Computes the score of a questionnaire from a participant's answers.
+        """Computes the score of a completed questionnaire.
 
         Args:
-            answers: The answers by item.
+            answers: Mapping from item name to answer.
 
         Returns:
-            The raw NASA Task Load Index for `tlx`, the score of the System Usability Scale for
-            `sus`, and the mean of the answers for any other questionnaire. `None` if an answer
-            is missing.
+            The raw NASA Task Load Index for `tlx`, the System Usability Scale score for `sus`,
+            or the mean answer for any other questionnaire. `None` if an answer is missing.
         """
         given_answers = {item: value for item, value in answers.items() if value is not None}
         if len(given_answers) < len(answers):
@@ -127,14 +127,13 @@ class Questionnaire(Frozen, frozen=True):
         return float(np.mean(list(given_answers.values())))
 
     def find_form(self) -> "Questionnaire":
-        """Returns a questionnaire with the questions that participants answer.
+        """Returns the questionnaire with its items filled in.
 
-        An experiment's protocol may name a shipped questionnaire without stating its questions
-        (items).
+        A protocol may name a built-in questionnaire without listing its items.
 
         Raises:
-            UsageError: The questionnaire has no items and is not a shipped questionnaire, or
-                its scale does not have 2 to 101 numbers.
+            UsageError: The questionnaire has no items and is not built in, or its scale does
+                not have 2 to 101 values.
         """
         name = self.name
         built_in = _read_shipped()

@@ -1,12 +1,11 @@
-"""Finds the smallest difference that a participant perceives, with an adaptive staircase.
+"""Measures the smallest difference that a participant perceives, with an adaptive staircase.
 
-A staircase consists of pairs of trials. In one trial of a pair, a key of the scenario has its
-standard value, in the other a larger value. The order of the two is drawn at random. After each
-pair, the participant says in which trial the value was larger. After `down` right answers in a
-row the difference is divided by `factor`, and after a wrong answer it is multiplied by `factor`
-(Levitt, 1971). The difference settles where steps down and up are equally likely. At this
-difference, the probability of a right answer is 0.5^(1 / down), for example 0.707 for `down` =
-2.
+A staircase consists of pairs of trials. In one trial of a pair, a scenario key has its standard
+value, in the other a larger value; the order is drawn at random. After each pair, the
+participant says in which trial the value was larger. The difference is divided by `factor`
+after `down` consecutive right answers, and multiplied by `factor` after a wrong answer (Levitt,
+1971). It converges to the difference at which steps down and up are equally likely, where the
+probability of a right answer is 0.5^(1 / down), for example 0.707 for `down` = 2.
 
 Invariant:
     - The differences in a block depend only on the protocol and on the earlier answers in the
@@ -33,22 +32,22 @@ SKIPPED_REVERSALS = 2
 
 
 class Staircase(Frozen, frozen=True):
-    """Settings of a perception test that finds the smallest difference a participant notices.
+    """Settings of a perception test for the smallest difference that a participant notices.
 
     Trials come in pairs. A scenario key, such as the delay, has its standard value in one trial
-    of a pair, and a larger value in the other. The participant says in which trial the value
-    was larger. The difference between the two values decreases after right answers, and
-    increases after wrong answers.
+    of a pair and a larger value in the other. The participant says in which trial the value was
+    larger. The difference between the two values decreases after right answers and increases
+    after wrong answers.
 
     Attributes:
-        key: The scenario key that is varied.
-        start: First difference, which is also the largest, in the key's unit.
-        standard: Value of the key in the standard trial, in the key's unit.
+        key: The scenario key to vary.
+        start: Initial and largest difference, in the unit of the key.
+        standard: Value of the key in the standard trial, in the unit of the key.
         factor: Factor by which the difference changes.
-        down: Number of right answers in a row after which the difference decreases.
-        asks: Question that participants answer after each pair.
-        deviation: Standard deviation of the perception of a simulated participant, in the key's
-            unit. If `None`, it is a quarter of `start`.
+        down: Number of consecutive right answers after which the difference decreases.
+        asks: Question asked after each pair.
+        deviation: Standard deviation of a synthetic participant's perception, in the unit of
+            the key. If `None`, a quarter of `start`.
     """
 
     key: str
@@ -61,19 +60,19 @@ class Staircase(Frozen, frozen=True):
 
     @property
     def measure(self) -> str:
-        """Name of the perception threshold that the experiment measures, with its unit.
+        """Name of the measured perception threshold, including its unit.
 
-        The name is "threshold_", followed by the last part of the varied setting. For example,
-        the key `link.delay_ms` gives threshold_delay_ms.
+        Composed of "threshold_" and the last part of the varied key. For example,
+        `link.delay_ms` gives threshold_delay_ms.
         """
         parts = [part for part in self.key.split(".") if not part.isdigit()]
         return f"threshold_{parts[-1]}"
 
     @property
     def form(self) -> Questionnaire:
-        """Question that participants answer after each pair of trials.
+        """Question asked after each pair of trials.
 
-        The answer is 1 or 2, the trial of the pair in which the varied quantity, such as a
+        The answer, 1 or 2, is the trial of the pair in which the varied quantity, such as a
         delay, seemed larger.
         """
         return Questionnaire(
@@ -110,17 +109,16 @@ class Staircase(Frozen, frozen=True):
         return directions
 
     def list_differences(self, right: Sequence[bool]) -> list[float]:
-        """Lists the differences that a participant has compared, and the next difference.
+        """Lists the differences that a participant has compared so far, and the next one.
 
-        In each pair of trials, a scenario key has its standard value in one trial, and a value
-        that is larger by the difference in the other. The difference decreases after `down`
-        right answers in a row, and increases after a wrong answer, up to its start value.
+        The difference decreases after `down` consecutive right answers and increases after a
+        wrong answer, up to its initial value.
 
         Args:
-            right: For each answered pair in order, True if the answer was right.
+            right: One entry per answered pair, in order: True if the answer was right.
 
         Returns:
-            The differences in the key's unit, one for each answered pair and one for the next
+            The differences in the unit of the key, one per answered pair and one for the next
             pair.
         """
         differences = [self.start]
@@ -130,18 +128,18 @@ class Staircase(Frozen, frozen=True):
         return differences
 
     def find_threshold(self, right: Sequence[bool]) -> float | None:
-        """Returns the perception threshold: the difference at which the staircase has settled.
+        """Returns the perception threshold, to which the staircase has converged.
 
-        The threshold is the geometric mean of the differences at the reversals, which are the
-        steps whose direction differs from that of the previous step. The first two reversals
-        are left out, because the difference is still far from its final value. If the number of
-        reversals is odd, the third is also left out, so that as many reversals lead up as down.
+        The threshold is the geometric mean of the differences at the reversals, that is, at
+        steps in the opposite direction to the previous step. The first two reversals are
+        excluded, since the difference is still far from its final value. If the number of
+        reversals is odd, the third is also excluded, to balance upward and downward reversals.
 
         Args:
-            right: For each answer, True if it was right.
+            right: One entry per answer: True if the answer was right.
 
         Returns:
-            The threshold in the key's unit. `None` if no reversals are left.
+            The threshold in the unit of the key, or `None` if no reversals remain.
         """
         # There is one more difference than directions: that of the next pair.
         pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)
@@ -161,13 +159,13 @@ class Staircase(Frozen, frozen=True):
     def draw_choice(self, difference: float, comparison: int, seed: int) -> int:
         """Draws which trial of a pair a synthetic participant chooses.
 
-        The participant perceives each trial with a normal error. Therefore, the choice is right
-        with probability Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
+        The perception of each trial has a normally distributed error. The choice is therefore
+        right with probability Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
 
         Args:
-            difference: Difference within the pair, in the key's unit.
+            difference: Difference within the pair, in the unit of the key.
             comparison: Number of the trial with the larger value, 1 or 2.
-            seed: Seed of the choice.
+            seed: Random seed.
 
         Returns:
             Number of the chosen trial, 1 or 2.
@@ -181,10 +179,10 @@ class Staircase(Frozen, frozen=True):
         return comparison if perceived_difference > 0.0 else standard_trial
 
     def describe(self) -> str:
-        """Describes in a sentence for a paper how the perception threshold was measured.
+        """Describes in one sentence, for use in a paper, how the threshold was measured.
 
         The sentence states the key, its standard value, the rule for the differences, and the
-        share of right answers at the threshold.
+        proportion of right answers at the threshold.
         """
         right_percent = 100.0 * 0.5 ** (1.0 / self.down)
         return (

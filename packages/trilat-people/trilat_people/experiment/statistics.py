@@ -1,16 +1,16 @@
-"""Computes statistics of experiments with people: means, tests and power.
+"""Statistics for experiments with people: means, tests and power.
 
-All functions read tidy rows: each trial is a mapping with `participant`, `pair`, `condition`
-and the measures by name, as in `trials.csv`. A trial whose value of a measure is `None` or ""
-is left out for this measure. A unit is sampled independently: it is a participant, or a pair
-whose members take part together.
+All functions take tidy rows as in `trials.csv`: each trial is a mapping with `participant`,
+`pair`, `condition` and one key per measure. A trial in which a measure is `None` or "" is
+excluded from the statistics of that measure. A unit is a participant, or a pair of participants
+who take part together, whichever is sampled independently.
 
 Invariant:
-    - Trials are averaged per unit and condition before any test, so that more trials do not
-      count as more participants.
-    - A measure that both users of a pair share is tested with `unit="pair"`.
-    - A statistic that the data do not determine is `None`.
-    - Equal rows and seeds give equal numbers.
+    - Trials are averaged per unit and condition before any test, so more trials do not count as
+      more participants.
+    - A measure shared by both users of a pair is tested with `unit="pair"`.
+    - A statistic that is undefined for the data is `None`.
+    - Equal rows and seeds give equal results.
 """
 
 import math
@@ -59,17 +59,16 @@ def average_trials(
 ) -> dict[str, dict[str, float]]:
     """Averages a measure over the trials of each participant or pair under each condition.
 
-    The statistics are computed from these means, because trials of the same participant are not
+    The statistics are computed from these means because trials of the same participant are not
     independent.
 
     Args:
-        rows: Trials, as mappings from column names to values.
+        rows: Trials, each a mapping from column name to value.
         measure: Name of the measure.
-        unit: Key of the independently sampled unit: "participant" or "pair".
+        unit: Key of the independently sampled unit, "participant" or "pair".
 
     Returns:
-        The means, by condition and then by the name of the participant or pair, in the order of
-        the rows.
+        The means by condition and then by participant or pair, in the order of the rows.
 
     Raises:
         UsageError: No row has the measure, a row lacks a key, or a value is not a finite
@@ -107,10 +106,10 @@ def average_trials(
 
 
 def read_number(value: Any, measure: str, row: Row) -> float:
-    """Converts an entry of a result table to a number, and rejects any other text.
+    """Converts an entry of a result table to a number.
 
     Args:
-        value: A number, or its text from a CSV file.
+        value: A number, or a string from a CSV file.
         measure: Name of the measure, for the error message.
         row: The trial, for the error message.
 
@@ -134,18 +133,19 @@ def read_number(value: Any, measure: str, row: Row) -> float:
 class ConditionMean(NamedTuple):
     """Mean and spread of a measure under one condition, over participants or pairs.
 
-    A unit is sampled independently: it is a participant, or a pair whose members take part
-    together. The standard deviation and the intervals are `None` for fewer than two units.
+    A unit is a participant, or a pair of participants who take part together. The standard
+    deviation and the intervals are `None` if there are fewer than two units.
 
     Args:
         condition: Name of the condition.
         number: Number of units with at least one trial.
-        mean: Mean of the means of the units.
-        deviation: Standard deviation of the means of the units.
-        interval: 95 % confidence interval of the mean by Student's t.
-        bootstrap: 95 % confidence interval of the mean by the bias-corrected and accelerated
-            bootstrap (BCa).
-        missing: Number of trials, or questionnaires, without a value. They are not averaged.
+        mean: Mean of the unit means.
+        deviation: Standard deviation of the unit means.
+        interval: 95 % confidence interval of the mean from Student's t distribution.
+        bootstrap: 95 % confidence interval of the mean from the bias-corrected and accelerated
+            (BCa) bootstrap.
+        missing: Number of trials or questionnaires with no value, which are excluded from the
+            mean.
     """
 
     condition: str
@@ -160,20 +160,20 @@ class ConditionMean(NamedTuple):
 def summarise_conditions(
     rows: Sequence[Row], measure: str, *, unit: str = "participant", seed: int = 0
 ) -> list[ConditionMean]:
-    """Returns the mean of a measure under each condition, with its spread and intervals.
+    """Computes the mean of a measure under each condition, with its spread and intervals.
 
     The trials of each participant (or pair) are averaged first. Conditions in which no trial
-    has a value are left out.
+    has a value are omitted.
 
     Args:
-        rows: Trials as mappings from column names to values, as for `average_trials`.
-        measure: Name of the measure, which is a column.
-        unit: "participant" if participants are independent of each other. "pair" if the two
-            members of a pair did the trials together, and only pairs are independent.
-        seed: Seed of the bootstrap, a confidence interval that uses random samples.
+        rows: Trials, as for `average_trials`.
+        measure: Name of the measure.
+        unit: "participant" if participants are independent of each other; "pair" if two
+            participants did the trials together, so that only pairs are independent.
+        seed: Random seed of the bootstrap.
 
     Returns:
-        A summary per condition, in the order in which the conditions first occur.
+        One summary per condition, in the order in which the conditions first occur.
     """
     means = average_trials(rows, measure, unit)
     rows_without_value = [row for row in rows if row.get(measure) in (None, "")]
@@ -222,20 +222,20 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
 
 
 def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, float] | None:
-    """Computes the 95 % confidence interval of a mean by the BCa bootstrap.
+    """Computes the 95 % confidence interval of a mean with the BCa bootstrap.
 
-    The bootstrap resamples the values with replacement, and does not assume a normal
-    distribution. BCa means bias-corrected and accelerated.
+    The bias-corrected and accelerated (BCa) bootstrap resamples the values with replacement and
+    does not assume a normal distribution.
 
     Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association
     82 (1987).
 
     Args:
         values: The values, one per participant or pair.
-        seed: Seed of the resampling.
+        seed: Random seed of the resampling.
 
     Returns:
-        Lower and upper end. `None` for fewer than two values.
+        Lower and upper end, or `None` for fewer than two values.
     """
     sample = np.asarray(values, dtype=np.float64)
     if sample.size < 2:
@@ -263,26 +263,26 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
 
 
 class Comparison(NamedTuple):
-    """Comparison of a measure between two conditions, within units.
+    """Within-unit comparison of a measure between two conditions.
 
-    Interval, tests and effect sizes need at least two units, and are otherwise `None`.
+    The interval, tests and effect sizes are `None` for fewer than two units.
 
     Args:
         measure: Name of the measure.
         first: Name of the first condition.
         second: Name of the second condition.
         number: Number of units that have both conditions.
-        difference: Mean of second minus first.
-        interval: 95 % interval of the difference by Student's t.
+        difference: Mean of the difference second minus first.
+        interval: 95 % confidence interval of the difference from Student's t distribution.
         t: Statistic of the paired test, with number - 1 degrees of freedom. `None` if all
             differences are equal.
-        p: Two-sided p value of the paired test.
-        p_holm: p corrected for all comparisons of the measure.
-        d_z: Effect size: difference over the standard deviation of the differences.
-        d_av: Effect size: difference over the mean of the standard deviations of both
-            conditions.
-        p_wilcoxon: Two-sided p value of the signed-rank test, not corrected. Differences of
-            zero are left out.
+        p: Two-sided p value of the paired t test.
+        p_holm: p value corrected for all comparisons of the measure.
+        d_z: Effect size: difference divided by the standard deviation of the differences.
+        d_av: Effect size: difference divided by the mean of the two conditions' standard
+            deviations.
+        p_wilcoxon: Two-sided, uncorrected p value of the Wilcoxon signed-rank test, excluding
+            zero differences.
     """
 
     measure: str
@@ -311,10 +311,10 @@ def compare_conditions(
     Args:
         rows: Trials, as for `average_trials`.
         measure: Name of the measure.
-        unit: "participant" or "pair", which is sampled independently.
+        unit: The independently sampled unit, "participant" or "pair".
 
     Returns:
-        A comparison for each pair of conditions, in the order of the rows.
+        One comparison per pair of conditions, in the order of the rows.
     """
     means = average_trials(rows, measure, unit)
     comparisons: list[Comparison] = []
@@ -381,9 +381,9 @@ def _compare(
 
 
 def correct_holm(p: Sequence[float | None]) -> list[float | None]:
-    """Corrects the p values of several tests by Holm's method.
+    """Corrects the p values of several tests with Holm's method.
 
-    Without a correction, the number of tests that are significant by chance grows with the
+    Without correction, the number of results that are significant by chance grows with the
     number of tests. The smallest of n p values is multiplied by n, the next by n - 1, and so
     on.
 
@@ -391,7 +391,7 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
         p: p values. `None` does not count as a test.
 
     Returns:
-        The corrected values in the same order. `None` stays `None`.
+        The corrected values in the same order, with `None` unchanged.
     """
     ascending = sorted((value, index) for index, value in enumerate(p) if value is not None)
     corrected: list[float | None] = [None] * len(p)
@@ -409,7 +409,7 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
 
 
 class MixedEffect(NamedTuple):
-    """Effect of one condition on a measure in a mixed model, a regression for repeated trials.
+    """Effect of one condition on a measure in a mixed model.
 
     The effect is relative to the first condition.
 
@@ -418,7 +418,7 @@ class MixedEffect(NamedTuple):
         estimate: Estimated difference from the first condition.
         error: Standard error of the estimate.
         interval: 95 % confidence interval of the estimate.
-        t: Estimate over its standard error.
+        t: Estimate divided by its standard error.
         p: Two-sided p value of t.
     """
 
@@ -431,21 +431,20 @@ class MixedEffect(NamedTuple):
 
 
 class MixedModel(NamedTuple):
-    """Mixed model of a measure, fitted to the means of participants by REML.
+    """Mixed model of a measure, fitted to the participants' means.
 
-    REML is the method of restricted maximum likelihood. The formula of the model is
-    `measure ~ condition + (1 | pair/participant)`: pairs, and participants within pairs, may
-    differ by random amounts.
+    The model is `measure ~ condition + (1 | pair/participant)`, with random effects of pairs
+    and of participants within pairs, fitted by restricted maximum likelihood (REML).
 
     Args:
         measure: Name of the measure.
-        reference: The first condition, with which the other conditions are compared.
+        reference: The first condition, to which the others are compared.
         effects: Effect of each other condition.
         freedom: Degrees of freedom of t: number of observations minus number of participants
-            minus number of effects. They equal those of the analysis of variance if all
+            minus number of effects. Equal to those of an analysis of variance if all
             participants have all conditions.
-        variances: Variance of "pair", of "participant" within a pair, and of the "residual".
-        notes: Warnings of the fit, for example of a variance at 0.
+        variances: Variances of "pair", of "participant" (within a pair) and of "residual".
+        notes: Warnings from the fit, for example about a variance of 0.
     """
 
     measure: str
@@ -459,10 +458,10 @@ class MixedModel(NamedTuple):
 def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     """Fits a mixed model of a measure, with participants nested within pairs.
 
-    Such a model can compare conditions although the values are not independent: the values of
-    one participant are similar, and so are those of the two participants of a pair. It is meant
-    for measures of single users. A measure that both users of a pair share is tested by
-    `compare_conditions` with `unit="pair"`. The fit needs `pip install 'trilat-net[stats]'`.
+    The model compares conditions while accounting for the correlation between values of the
+    same participant and of the same pair. Use it for measures of individual users. For a
+    measure shared by both users of a pair, use `compare_conditions` with `unit="pair"`.
+    Requires `pip install 'trilat-net[stats]'`.
 
     Args:
         rows: Trials, as for `average_trials`, with the keys "pair" and "participant".
@@ -623,19 +622,19 @@ def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
 
 
 def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
-    """Computes the power of a two-sided paired t test, by the noncentral t distribution.
+    """Computes the power of a two-sided paired t test from the noncentral t distribution.
 
     The power is the probability that the test finds an effect of a given size.
 
     Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988).
 
     Args:
-        d_z: Size of the effect: mean over standard deviation of the differences.
+        d_z: Effect size: mean of the differences divided by their standard deviation.
         number: Number of units.
         alpha: Significance level.
 
     Returns:
-        The power, from 0 to 1.
+        The power, between 0 and 1.
 
     Raises:
         UsageError: There are fewer than two units, or alpha is not between 0 and 1.
@@ -659,15 +658,15 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
 def find_least_number(
     d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000
 ) -> int:
-    """Returns the smallest number of participants (or pairs) for a test of the desired power.
+    """Returns the smallest number of participants (or pairs) for a desired power.
 
-    The power is the probability that the test finds the effect if it exists.
+    The power is the probability that the test detects an effect that exists.
 
     Args:
-        d_z: Size of the effect: mean over standard deviation of the differences.
+        d_z: Effect size: mean of the differences divided by their standard deviation.
         wanted: Desired power, between 0 and 1.
         alpha: Significance level.
-        most: Largest number of units that is tried.
+        most: Largest number of units to try.
 
     Raises:
         UsageError: More than `most` units are needed, or `wanted` is not between 0 and 1.
@@ -685,18 +684,15 @@ def find_least_number(
 
 
 class SimulatedPower(NamedTuple):
-    """Fraction of simulated experiments in which two conditions differ significantly.
-
-    The fraction estimates the power: the probability that an experiment finds the simulated
-    effect.
+    """Estimated power: fraction of simulated experiments with a significant difference.
 
     Args:
         first: Name of the first condition.
         second: Name of the second condition.
-        d_z: Size of the simulated effect.
-        found: Share of the experiments with p below alpha.
-        interval: 95 % interval of `found`.
-        found_holm: Share of the experiments with the corrected p below alpha.
+        d_z: Effect size in the simulation.
+        found: Fraction of experiments with p below alpha.
+        interval: 95 % confidence interval of `found`.
+        found_holm: Fraction of experiments with the corrected p below alpha.
     """
 
     first: str
@@ -718,19 +714,19 @@ def simulate_power(
     repetitions: int = 500,
     seed: int = 0,
 ) -> list[SimulatedPower]:
-    """Computes the power for each pair of conditions from simulated experiments.
+    """Estimates the power for each pair of conditions from simulated experiments.
 
-    Trials are drawn from normal distributions and compared by `compare_conditions`.
+    Trials are drawn from normal distributions and compared with `compare_conditions`.
 
     Args:
-        means: Expected mean of a measure by condition.
+        means: Mapping from condition to the expected mean of the measure.
         number: Number of participants.
-        trial_deviation: Standard deviation from trial to trial.
-        trials: Number of trials of a participant under a condition.
-        effect_deviation: Standard deviation, over participants, of the effect of a condition.
+        trial_deviation: Standard deviation between trials.
+        trials: Number of trials per participant and condition.
+        effect_deviation: Standard deviation between participants of the effect of a condition.
         alpha: Significance level of the tests.
         repetitions: Number of simulated experiments.
-        seed: Seed of the random numbers.
+        seed: Random seed.
     """
     generator = np.random.default_rng(seed)
     experiments: list[list[Comparison]] = []

@@ -2,17 +2,16 @@
 
 The synthetic participant sees the slave arm over the network, and moves the hand at its master
 so that the slave reaches the target:
-    - It makes movements of minimum jerk (Flash and Hogan, 1985), whose end points scatter in
-      proportion to their length (Harris and Wolpert, 1998) and whose durations follow Fitts'
-      law.
-    - Before a correction it waits until the slave is at rest, as people do with a delay
-      (Ferrell, 1965).
-    - It follows a moving target with a correction rate that decreases with the known delay
+    - Movements have minimum jerk (Flash and Hogan, 1985), end points that scatter in proportion
+      to their length (Harris and Wolpert, 1998), and durations that follow Fitts' law.
+    - Before a correction, the participant waits until the slave is at rest, as people do under
+      delay (Ferrell, 1965).
+    - A moving target is followed with a correction rate that decreases with the known delay
       (McRuer and Jex, 1967).
-    - With practice it becomes faster according to an exponential law.
+    - Practice shortens movements according to an exponential law.
 
 Invariant:
-    - The motion depends only on the participant's view, its parameters and its seed.
+    - The motion depends only on the participant's view, parameters and seed.
 """
 
 import math
@@ -39,22 +38,22 @@ DELAY_MARGIN = 0.7
 
 
 class ParticipantModel(Frozen, frozen=True):
-    """Parameters of synthetic participants, which are models of people.
+    """Mean parameters of synthetic participants.
 
-    They are mean values, from which `draw` derives participants who differ from each other. The
-    duration of a movement follows Fitts's law: it grows with the index of difficulty,
-    log2(distance / width + 1).
+    `draw` varies these means to create different participants. The duration of a movement
+    follows Fitts's law: it increases with the index of difficulty, log2(distance / width + 1).
 
     Attributes:
         reaction_s: Time from a visible event to the participant's reaction, in s.
-        fitts_a_s: Duration of a movement of no difficulty, in s.
-        fitts_b_s: Additional duration for each bit of the index of difficulty, in s.
+        fitts_a_s: Duration of a movement with zero difficulty, in s.
+        fitts_b_s: Additional duration per bit of the index of difficulty, in s.
         noise: Standard deviation of a movement's end point, as a fraction of the movement's
             length.
-        crossover_rad_s: Rate at which a moving target is followed without a delay, in rad/s.
-        learning: Fraction by which a first trial is slower than a practised trial.
+        crossover_rad_s: Rate at which a moving target is followed in the absence of delay, in
+            rad/s.
+        learning: Fraction by which the first trial is slower than a practised one.
         practised: Number of trials after which the fraction `learning` has halved.
-        spread: Standard deviation of the logarithm of a participant's parameters.
+        spread: Standard deviation of the logarithms of a participant's parameters.
     """
 
     reaction_s: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.25
@@ -67,13 +66,13 @@ class ParticipantModel(Frozen, frozen=True):
     spread: Share = 0.15
 
     def draw(self, seed: int) -> "ParticipantModel":
-        """Returns the model of one participant, who differs from this mean model by chance.
+        """Draws an individual participant around these mean parameters.
 
-        Five parameters are multiplied by log-normal factors with the deviation `spread`:
-        reaction time, both constants of Fitts' law, noise and crossover frequency.
+        Multiplies five parameters by log-normal factors with the deviation `spread`: the
+        reaction time, both constants of Fitts' law, the noise and the crossover frequency.
 
         Args:
-            seed: Seed of the random numbers. Equal seeds give the same participant.
+            seed: Random seed. Equal seeds give the same participant.
         """
         random = np.random.default_rng(seed)
         logarithms = self.spread * random.standard_normal(5)
@@ -91,20 +90,20 @@ class ParticipantModel(Frozen, frozen=True):
 
 
 class SyntheticParticipant:
-    """A model of a person at one master arm in one trial, for experiments without people.
+    """A model of a person at one master arm during one trial.
 
-    It has the interface of a user-written operator program: the site of the arm calls `act` at
-    a fixed rate, and moves the arm towards the returned position.
+    Implements the interface of a user's operator program: the site of the arm calls `act` at a
+    fixed rate and moves the arm towards the returned position.
 
     Args:
-        facts: Description of the participant's site.
+        facts: Information about the participant's site.
         model: Parameters of the participant.
         goal: Goal of the trial.
-        slave: Name of the slave's site, the slave's arm, and a function that returns the force
+        slave: Name of the slave's site, the slave's arm, and a function that computes the force
             on the end effector, in N, from joint angles and torques.
-        before: Number of earlier trials of the participant.
-        seed: Seed of the trial.
-        user: Index of the participant among the users, from 0.
+        before: Number of trials that the participant has done before.
+        seed: Random seed of the trial.
+        user: Index of the participant among the users, starting at 0.
     """
 
     def __init__(
@@ -136,16 +135,16 @@ class SyntheticParticipant:
         self._moved_s = 0.0
 
     def act(self, now: HandView) -> Array:
-        """Decides where the simulated person moves the arm now.
+        """Decides where the participant currently moves the arm.
 
-        The person sees the slave arm and the target with a delay, and starts a new movement
-        when the slave is at rest outside the target.
+        The participant sees the slave arm and the target with a delay, and starts a new
+        movement when the slave is at rest outside the target.
 
         Args:
-            now: The participant's view and felt force at its site.
+            now: What the participant sees and feels at its site.
 
         Returns:
-            The target position of the hand, shape (2,) or (3,), in m.
+            Target position of the hand, in m, shape (2,) or (3,).
         """
         slave = now.peers[self._slave_index]
         slave_m = self._see_slave(now, slave)

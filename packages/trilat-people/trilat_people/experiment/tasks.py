@@ -1,17 +1,17 @@
-"""Defines the tasks of an experiment: reach a target, hand over, press a wall, track a path.
+"""Tasks of an experiment: reach a target, hand over, press a wall, follow a moving target.
 
 A protocol defines a `_TrialTask` with its parameters, such as the distance of the targets. For
-each trial, the task creates a `TrialGoal`. The goal computes the position of the target at any
-time, and judges the result of the trial. The participants move the slave arm over the network
+each trial, the task creates a `TrialGoal`, which computes the position of the target at any
+time and judges the result of the trial. The participants move the slave arm over the network
 with their master arms.
 
 Invariant:
-    - The goal of a trial depends only on the task's parameters, the trial's seed, and the start
-      position of the slave's arm.
-    - A trial is judged by the position of the slave's end effector and by the force on it. The
-      delayed pictures that the users see play no role.
-    - A trial ends when the end effector has stayed at the goal, when its time is over, or when
-      a rule of the task is broken.
+    - The goal of a trial depends only on the parameters of the task, the seed of the trial and
+      the start position of the slave arm.
+    - A trial is judged by the position of the slave's end effector and the force on it, not by
+      the delayed pictures that the users see.
+    - A trial ends when the end effector has stayed at the goal, when the time is up, or when a
+      rule of the task is broken.
 """
 
 import math
@@ -46,28 +46,27 @@ class _TrialTask(Frozen, frozen=True, tag_field="kind"):
     needs_wall: ClassVar[bool] = False
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the text that tells participants of the experiment what to do in this task.
+        """Returns the instructions shown to participants for this task.
 
         Args:
-            slave: Name of the slave arm, which the participants move, as it appears in the
-                text.
+            slave: Name of the slave arm to use in the instructions.
         """
         return self.instructions.format(slave=slave, task=self)
 
     @property
     def longest_s(self) -> float:
-        """Longest duration of a trial after the appearance of its target, in s.
+        """Longest duration of a trial after its target has appeared, in s.
 
         With a time limit (`has_limit`), a trial that has not succeeded by then has failed.
-        Without a limit, every trial lasts exactly this long.
+        Otherwise, every trial lasts exactly this long.
         """
         raise NotImplementedError
 
     @property
     def has_limit(self) -> bool:
-        """True if a trial fails when the participant has not finished in `longest_s` seconds.
+        """True if a trial fails unless it is completed within `longest_s` seconds.
 
-        False if every trial lasts exactly `longest_s` seconds, as for following a moving
+        False if every trial lasts exactly `longest_s` seconds, as when following a moving
         target.
         """
         return True
@@ -76,40 +75,38 @@ class _TrialTask(Frozen, frozen=True, tag_field="kind"):
     def needs_pair(self) -> bool:
         """True if two participants perform the task together.
 
-        If so, the protocol of the experiment must name two master arms.
+        The protocol of the experiment must then name two master arms.
         """
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Creates the goal of one trial, which states its target and decides when it ends.
+        """Creates the goal of one trial: its target, and the rule for when it ends.
 
         Args:
-            start_m: Position of the slave's end effector at the start, shape (2,) or (3,), in
-                m.
-            number: Number of the target, from 0.
-            seed: Seed of the trial.
+            start_m: Start position of the slave's end effector, in m, shape (2,) or (3,).
+            number: Index of the target, starting at 0.
+            seed: Random seed of the trial.
         """
         raise NotImplementedError
 
 
 class TrialGoal:
-    """Target of one trial of an experiment, and the rule that decides when the trial ends.
+    """Target of one trial, and the rule that decides when the trial ends.
 
     Args:
-        start_m: Position of the slave's end effector at the start, in m.
+        start_m: Start position of the slave's end effector, in m.
         width_m: Diameter of the target, in m.
 
     Attributes:
-        start_m: Position of the target before it appears, in m, which is the slave's start
-            position.
+        start_m: Position of the target before it appears (the slave's start position), in m.
         width_m: Diameter of the target, in m.
-        appears_s: Time at which the target appears, in s. Users must wait until then.
-        is_moving: True if the target moves after it has appeared.
-        force_n: Force with which to press, in N. 0 if the task does not require a force.
-        lead: The first user's share of the authority that two users have over the slave, until
-            a handover. If `None`, the scenario's dominance factors apply.
-        handover: Time from the target's appearance until the second user receives the
-            authority, and duration of the change, both in s. `None` if there is no handover.
+        appears_s: Time at which the target appears, in s. Users must wait for it.
+        is_moving: True if the target moves after appearing.
+        force_n: Force to apply, in N, or 0 if the task does not require a force.
+        lead: First user's share of the authority that both users have over the slave, until a
+            handover. If `None`, the scenario's dominance factors apply.
+        handover: Time from the appearance of the target until authority passes to the second
+            user, and duration of the transition, both in s. `None` if there is no handover.
     """
 
     is_moving = False
@@ -123,42 +120,45 @@ class TrialGoal:
         self.appears_s = 0.0
 
     def find_target_m(self, t_s: float, user: int | None = None) -> Array:
-        """Returns the target position of the end effector at a time, shape (2,) or (3,), in m.
+        """Returns the target position of the end effector at a given time, in m.
 
         Args:
             t_s: Time since the start of the session, in s.
-            user: Index of the user whose target is returned, from 0. If `None`, the middle of
-                all users' targets is returned.
+            user: Index of the user whose target is returned, starting at 0. If `None`, the
+                midpoint of all users' targets is returned.
+
+        Returns:
+            The position, shape (2,) or (3,).
         """
         if t_s < self.appears_s:
             return self.start_m
         return self._find_target_m(t_s - self.appears_s, user)
 
     def judge(self, t_s: float, position_m: Array, force_n: float = 0.0) -> "Outcome | None":
-        """Judges whether the trial ends now.
+        """Decides whether the trial ends now.
 
-        A trial is one execution of the task. The judgement begins when the target appears.
+        A trial is judged from the appearance of the target on.
 
         Args:
             t_s: Time since the start of the session, in s.
-            position_m: Position of the end effector, shape (2,) or (3,), in m.
+            position_m: Position of the end effector, in m, shape (2,) or (3,).
             force_n: Magnitude of the force on the end effector, in N.
 
         Returns:
-            The outcome of the trial. `None` while the trial continues.
+            The outcome of the trial, or `None` while the trial continues.
         """
         if t_s < self.appears_s:
             return None
         return self._judge(t_s, position_m, force_n)
 
     def has_authority(self, t_s: float, user: int) -> bool:
-        """Returns True if the slave follows a user at a given time of the trial.
+        """Returns True if the slave follows the given user at the given time.
 
-        With a handover, the authority over the slave moves from the first user to the second.
+        In a handover, authority over the slave passes from the first user to the second.
 
         Args:
             t_s: Time since the start of the session, in s.
-            user: Index of the user, from 0.
+            user: Index of the user, starting at 0.
         """
         if self.lead is None:
             return True
@@ -170,15 +170,15 @@ class TrialGoal:
         return abs(user_lead) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
-        """Returns the corridor to the target, which the end effector may not leave.
+        """Returns the corridor that the end effector must not leave.
 
-        The corridor is straight, and its other end is the target.
+        The corridor is straight and ends at the target.
 
         Args:
             t_s: Time since the start of the session, in s.
 
         Returns:
-            The start of the corridor and its width, both in m. `None` if there is no corridor.
+            The start and width of the corridor, both in m, or `None` if there is no corridor.
         """
         return None
 
@@ -188,15 +188,16 @@ class TrialGoal:
         position_m: Array,  # noqa: ARG002
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Computes measures of this task alone, such as the mean force against a wall.
+        """Computes the measures specific to this task, such as the mean force against a wall.
 
         Args:
-            after_s: Times since the target's appearance, shape (K,), in s.
-            position_m: Positions of the slave's end effector, shape (K, 2) or (K, 3), in m.
-            force_n: Magnitudes of the force on the end effector, shape (K,), in N.
+            after_s: Times since the appearance of the target, in s, shape (K,).
+            position_m: Positions of the slave's end effector, in m, shape (K, 2) or (K, 3).
+            force_n: Magnitudes of the force on the end effector, in N, shape (K,).
 
         Returns:
-            The measures by name. Empty if the task has no measures of its own.
+            Mapping from the name of each measure to its value. Empty if the task has no
+            measures of its own.
         """
         return {}
 
@@ -222,13 +223,12 @@ class TrialGoal:
 
 
 class Outcome(NamedTuple):
-    """Result of a trial: whether the task was done, and the time of the end.
-
-    A trial without an outcome is still running.
+    """Result of a completed trial.
 
     Attributes:
-        succeeded: True if the task was done. False after the time limit or a broken rule.
-        ended_s: Time of the end, in s since the start of the session.
+        succeeded: True if the task was completed. False if the time limit was reached or a rule
+            was broken.
+        ended_s: Time at which the trial ended, in s since the start of the session.
     """
 
     succeeded: bool
@@ -236,22 +236,22 @@ class Outcome(NamedTuple):
 
 
 class ReachTrial(_TrialTask, frozen=True, tag="reach"):
-    """Task of an experiment: move the arm to targets on a ring, as in ISO 9241-411.
+    """Task: move the arm to targets on a ring, as in ISO 9241-411.
 
-    Each target is opposite the previous target.
+    Each target is opposite the previous one.
 
     Attributes:
         targets: Number of targets.
         distance_m: Radius of the ring around the start, in m.
         width_m: Diameter of a target, in m.
-        dwell_s: Time for which the end effector must stay in the target, in s.
-        timeout_s: Time after which the trial has failed, in s.
-        corridor_m: Width of the straight corridor to the target, in m, which the users may not
-            leave. `None` if the users may choose the path.
-        handover_s: Time after which the second user receives the first user's authority, in s.
+        dwell_s: Time that the end effector must stay in the target, in s.
+        timeout_s: Time limit of a trial, in s.
+        corridor_m: Width of the straight corridor to the target, which the users must not
+            leave, in m. `None` if the path is free.
+        handover_s: Time after which authority passes from the first user to the second, in s.
             `None` if there is no handover.
         ramp_s: Duration of the handover, in s. The end effector must stay in the target during
-            the handover. Then the next target appears.
+            the handover, after which the next target appears.
     """
 
     description: ClassVar[str] = "reaching to a ring of targets"
@@ -271,21 +271,21 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if two participants reach the target together.
+        """True if the task includes a handover, which requires two participants.
 
-        The first participant then hands over the control of the slave arm to the second
-        participant during the trial.
+        The first participant hands control of the slave arm over to the second during the
+        trial.
         """
         return self.handover_s is not None
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the text that tells the participants what to do in a reaching trial.
+        """Returns the instructions shown to participants for a reaching trial.
 
-        The text says how far they may leave the straight path to the target, and when the other
-        user takes over, if the task has these rules.
+        If the task has these rules, the instructions state how far the arm may leave the
+        straight path to the target and when the other user takes over.
 
         Args:
-            slave: Name of the slave arm as it appears in the text.
+            slave: Name of the slave arm to use in the instructions.
         """
         text = super().render_instructions(slave)
         if self.corridor_m is not None:
@@ -299,8 +299,8 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
     def longest_s(self) -> float:
         """Longest possible duration of a reaching trial after its target has appeared, in s.
 
-        It is `timeout_s`. If the first user hands the slave over to the second user, a second
-        target appears after the handover, and the time-out starts again.
+        Usually `timeout_s`. With a handover, a second target appears afterwards and the time
+        limit starts again.
         """
         if self.handover_s is None:
             return self.timeout_s
@@ -308,15 +308,14 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
         return self.timeout_s + second_appears_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
-        """Creates the goal of a reaching trial: its target on a ring around the start.
+        """Creates the goal of a reaching trial: a target on a ring around the start position.
 
-        The goal also contains the next target on the ring, which appears after a handover.
+        Includes the next target on the ring, which appears after a handover.
 
         Args:
-            start_m: Position of the slave's end effector at the start of the trial, in m. It is
-                the centre of the ring.
-            number: Number of the target, from 0.
-            seed: Not used, because the order of the targets is fixed.
+            start_m: Start position of the slave's end effector, the centre of the ring, in m.
+            number: Index of the target, starting at 0.
+            seed: Not used, since the order of the targets is fixed.
         """
         target_m = self._place_target_m(start_m, number)
         next_target_m = self._place_target_m(start_m, number + 1)
@@ -419,13 +418,12 @@ class _ReachGoal(_DwellGoal):
         position_m: Array,
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Computes how steady the end effector stayed at the target during the handover.
+        """Computes how steadily the end effector stayed at the target during the handover.
 
-        The measure is the largest distance from the target, in mm, while one user hands the
-        slave over to the other.
+        The measure is the largest distance from the target during the handover, in mm.
 
         Returns:
-            The measure by its name. Empty without a handover.
+            Mapping from the name of the measure to its value. Empty if there was no handover.
         """
         has_begun = after_s >= self._handover_s
         has_not_ended = after_s < self._second_appears_s
@@ -441,14 +439,13 @@ class _ReachGoal(_DwellGoal):
         return {"error_handover_mm": 1e3 * largest_error_m}
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:
-        """Returns the corridor to the target, once the target has appeared.
+        """Returns the straight corridor to the target, which participants must not leave.
 
-        The corridor is the straight path to the target, which participants must not leave. The
-        page draws it.
+        The corridor is drawn on the page once the target has appeared.
 
         Returns:
-            The start of the corridor and its width, both in m. `None` before the target
-            appears, and for a task without a corridor.
+            The start and width of the corridor, both in m. `None` before the target appears,
+            and for tasks with no corridor.
         """
         if self._corridor_m is None or t_s < self.appears_s:
             return None
@@ -510,16 +507,18 @@ class _ReachGoal(_DwellGoal):
 
 
 class ContactTrial(_TrialTask, frozen=True, tag="contact"):
-    """Task of an experiment: press a wall with a given force, and hold it for some time.
+    """Task: press against a wall with a given force and hold it for some time.
 
     Attributes:
-        axis: Axis of the arm's base frame along which the target is drawn, from 0.
-        distance_m: Distance from the start to the target, in m. Negative for the other side.
+        axis: Index of the axis of the arm's base frame along which the target is placed,
+            starting at 0.
+        distance_m: Distance from the start to the target, in m. Negative for the opposite
+            direction.
         width_m: Diameter of the target, in m.
-        force_n: Force with which to press, in N.
-        tolerance_n: Largest error of the force, in N.
-        dwell_s: Time for which the force must be held, in s.
-        timeout_s: Time after which the trial has failed, in s.
+        force_n: Force to apply, in N.
+        tolerance_n: Largest permitted force error, in N.
+        dwell_s: Time that the force must be held, in s.
+        timeout_s: Time limit of a trial, in s.
     """
 
     description: ClassVar[str] = "holding a force at a wall"
@@ -539,18 +538,18 @@ class ContactTrial(_TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """Time limit of a trial in s, within which the force at the wall must be held.
+        """Time limit of a trial, in s.
 
-        The trial has failed after this time.
+        A trial has failed if the force has not been held by then.
         """
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
-        """Creates the goal of a trial: where to touch the wall, and how strongly to press it.
+        """Creates the goal of a trial: where to touch the wall, and how hard to press.
 
         Args:
-            start_m: Position of the slave's end effector at the start, in m.
-            number: Not used, because there is one wall.
+            start_m: Start position of the slave's end effector, in m.
+            number: Not used, since there is only one wall.
             seed: Not used.
         """
         return _ContactGoal(self, start_m)
@@ -579,13 +578,13 @@ class _ContactGoal(_DwellGoal):
         position_m: Array,  # noqa: ARG002
         force_n: Array,
     ) -> dict[str, float]:
-        """Computes the accuracy with which the force was held at the end of the trial.
+        """Computes how accurately the force was held at the end of the trial.
 
-        The measures are the mean of the force and the RMS of its error, both in N, over the
-        time for which the force had to be held.
+        The measures are the mean force and the RMS force error, both in N, over the period in
+        which the force had to be held.
 
         Returns:
-            The measures by their names.
+            Mapping from the name of each measure to its value.
         """
         dwell_start_s = after_s[-1] - self._dwell_s
         is_dwell = after_s >= dwell_start_s
@@ -604,18 +603,18 @@ class _ContactGoal(_DwellGoal):
 
 
 class TrackTrial(_TrialTask, frozen=True, tag="track"):
-    """The task to follow a target that moves unpredictably along one axis.
+    """Task: follow a target that moves unpredictably along one axis.
 
-    The path is a sum of sines whose frequencies have no common multiple.
+    The path is a sum of sines with incommensurate frequencies.
 
     Attributes:
-        axis: Axis of the arm's base frame, from 0.
-        amplitude_m: Largest distance of the path from the start, in m.
-        frequencies_hz: Frequencies of the sines, in Hz. Their phases are drawn for every trial.
+        axis: Index of the axis of the arm's base frame, starting at 0.
+        amplitude_m: Largest distance from the start, in m.
+        frequencies_hz: Frequencies of the sines, in Hz. The phases are drawn for every trial.
         duration_s: Duration of a trial, in s.
         width_m: Diameter of the target, in m.
-        apart_m: Distance along the axis between the targets of the two users, in m. If it is
-            not 0, the users must agree on a position.
+        apart_m: Distance along the axis between the targets of the two users, in m. If nonzero,
+            the users must agree on a position.
     """
 
     description: ClassVar[str] = "tracking a path of sines"
@@ -633,32 +632,29 @@ class TrackTrial(_TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """Always False: following a target takes exactly `duration_s`, and cannot fail."""
+        """Always False: following a target takes exactly `duration_s` and cannot fail."""
         return False
 
     @property
     def needs_pair(self) -> bool:
-        """True if two participants follow a moving target together.
+        """True if two participants follow the target together.
 
-        They see different targets, and must agree on a position of the slave arm.
+        They see different targets and must agree on a position of the slave arm.
         """
         return self.apart_m > 0.0
 
     @property
     def longest_s(self) -> float:
-        """Duration of every trial of following a moving target, in s.
-
-        The duration starts when the target appears.
-        """
+        """Duration of every tracking trial, from the appearance of the target, in s."""
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
-        """Creates the goal of a trial: a path that begins at the slave's position.
+        """Creates the goal of a tracking trial: a path that begins at the slave's position.
 
         Args:
-            start_m: Position of the slave's end effector at the start, in m.
-            number: Number of the target, which is not used.
-            seed: Seed of the random numbers that determine the path.
+            start_m: Start position of the slave's end effector, in m.
+            number: Not used.
+            seed: Random seed from which the path is drawn.
         """
         random = np.random.default_rng(seed)
         sine_count = len(self.frequencies_hz)
@@ -684,17 +680,17 @@ class _TrackGoal(TrialGoal):
     ) -> dict[str, float]:
         """Computes which user's target the slave arm stayed closer to, if the targets differ.
 
-        The measure `first_settled` is 1 for the position of the first user's target, 0 for the
-        position of the second user's target, and 0.5 for the middle between them. It is
-        averaged over the trial.
+        The measure `first_settled` is 1 at the first user's target, 0 at the second user's
+        target, and 0.5 halfway between them, averaged over the trial.
 
         Args:
-            after_s: Times since the target's appearance, shape (K,), in s, for K records.
-            position_m: Positions of the slave's end effector, shape (K, 2) or (K, 3), in m.
+            after_s: Times since the appearance of the target, in s, shape (K,) for K records.
+            position_m: Positions of the slave's end effector, in m, shape (K, 2) or (K, 3).
             force_n: Not used.
 
         Returns:
-            The measure by its name. Empty if both users have the same target.
+            Mapping from the name of the measure to its value. Empty if both users have the same
+            target.
         """
         task = self._task
         if not task.needs_pair:
@@ -747,14 +743,12 @@ AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Computes the position of the slave's end effector from a state of its arm, in m.
-
-    The state is the one that the site (arm controller) sends to other sites.
+    """Computes the position of the slave's end effector, in m.
 
     Args:
         arm: Arm of the site.
-        shared: Coordinates that the sites exchange: joint angles in rad, or the pose of the end
-            effector.
+        shared: Coordinates that the site sends to its peers: joint angles in rad, or the pose
+            of the end effector.
     """
     position = shared[:3] if arm.shares_pose else arm.end_effector(shared)
     return np.array(position, dtype=np.float64)

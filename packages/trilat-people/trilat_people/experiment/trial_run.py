@@ -1,15 +1,15 @@
-"""Runs and judges one trial of an experiment, and computes its measures from its log.
+"""Runs and judges one trial of an experiment, and computes its measures from the log.
 
-In a trial the participants move the slave arm over the network, to do a task such as reaching a
-target. `ExperimentTrial` is a trial with people, recorded by a live session. `SyntheticTrial`
-is a trial of synthetic participants, which are models of people, and runs in virtual time.
+In a trial, the participants move the slave arm over the network to perform a task such as
+reaching a target. `ExperimentTrial` is a trial with people, recorded in a live session.
+`SyntheticTrial` is a trial with synthetic participants (models of people), run in virtual time.
 
 Invariant:
-    - The result of a trial is computed from its log. The log is executed again, and the task is
-      judged by the state of the slave in every period of its control loop.
-    - A trial of synthetic participants is simulated twice. The first simulation is fast, writes
-      no log, and finds out when the trial ends. The second simulation repeats the same motion,
-      writes the log, and stops shortly after this end.
+    - The result of a trial is computed from its log. The run is repeated from the log, and the
+      task is judged by the state of the slave in every control period.
+    - A trial with synthetic participants is simulated twice. The first simulation is fast,
+      writes no log, and determines when the trial ends. The second repeats the same motion,
+      writes the log, and stops shortly after that time.
 """
 
 import hashlib
@@ -51,15 +51,15 @@ REST_S = 0.1
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
-    """Result of one finished trial, as the experiment's journal file stores it.
+    """Result of one finished trial, as stored in the journal of the experiment.
 
     Attributes:
-        cell: Number of the trial.
-        seed: Seed of the trial.
+        cell: Number of the trial, which is the key of the entry.
+        seed: Random seed of the trial.
         sha256: Digest of the trial's log.
-        succeeded: True if the task was done.
-        measures: Measures by name, with units in the names.
-        people: False for synthetic participants.
+        succeeded: True if the task was completed.
+        measures: Mapping from the name of each measure, which includes the unit, to its value.
+        people: True if people took part, False for synthetic participants.
     """
 
     cell: int
@@ -71,16 +71,16 @@ class TrialEntry(msgspec.Struct, frozen=True):
 
 
 class TrialJudge:
-    """Decides during a trial whether it has ended, from the records of the slave arm.
+    """Decides from the records of the slave arm whether a trial has ended.
 
-    The records are passed on one after the other, as they arrive.
+    Records must be passed one at a time, as they arrive.
 
     Args:
         trial: The trial, with its scenario, slave arm and goal.
 
     Attributes:
         goal: Goal of the trial.
-        outcome: Outcome of the trial. `None` while the trial continues.
+        outcome: Outcome of the trial, or `None` while it continues.
     """
 
     def __init__(self, trial: "ExperimentTrial") -> None:
@@ -89,10 +89,7 @@ class TrialJudge:
         self.outcome: Outcome | None = None
 
     def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
-        """Takes the next record of the slave into account.
-
-        A record contains the measurements of the slave arm's site in one control period. The
-        trial may end with any record.
+        """Processes the next record of the slave.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -100,7 +97,7 @@ class TrialJudge:
             tau_x: Minus the torques of hands and environments ON the arm, in N m or N.
 
         Returns:
-            The outcome once the trial has ended, `None` before.
+            The outcome once the trial has ended; `None` until then.
         """
         if self.outcome is None:
             # The force is computed only for tasks that need it, because it takes long.
@@ -135,27 +132,23 @@ class _MotionSamples(NamedTuple):
 
 
 class ExperimentTrial:
-    """One trial of an experiment with people: its scenario, its goal, and its result.
-
-    A trial is one execution of a task by the participants, for example to move the arm to a
-    target.
+    """One trial of an experiment: its scenario, its goal and its result.
 
     Args:
         protocol: Protocol of the experiment, with the task and the users.
         scenario: Scenario of the condition: the arms, their control and the network.
-        planned: Entry of this trial in the list of all trials, with its participants, its
-            condition and its seed.
-        digest: Checksum that identifies the list of all trials. It is stored in the log.
+        planned: Entry of this trial in the plan, with its participants, condition and seed.
+        digest: Digest of the plan, which is stored in the log.
 
     Attributes:
-        people: False for synthetic participants, which are models of people.
+        people: True if people take part, False for synthetic participants.
         protocol: The argument of the same name.
         planned: The argument of the same name.
         slave: Name of the slave in the scenario.
         arm: Model of the slave arm.
-        scenario: Scenario of this trial, with the longest duration that the trial may have.
+        scenario: Scenario of this trial, whose duration is the longest that the trial may take.
         appears_s: Time at which the target appears, in s.
-        longest_s: Latest end of the trial, in s.
+        longest_s: Latest possible end of the trial, in s.
     """
 
     people = True
@@ -223,13 +216,13 @@ class ExperimentTrial:
         sum_of_shares = slave_factors[first] + slave_factors[second]
 
         def divide_shares(lead: float) -> dict[str, float]:
-            """Returns the weights with which the slave follows the other arms, in this trial.
+            """Returns the dominance factors of the slave for this trial.
 
-            Both users together keep the sum of their weights in the scenario: with a sum of 1,
-            lead = 0.7 gives 0.7 and 0.3.
+            The sum of both users' factors is that of the scenario: if it is 1, lead = 0.7 gives
+            0.7 and 0.3.
 
             Args:
-                lead: First user's share of the authority over the slave, from 0 to 1. The
+                lead: First user's share of the authority over the slave, between 0 and 1. The
                     second user has the rest.
             """
             first_share = sum_of_shares * lead
@@ -284,10 +277,10 @@ class ExperimentTrial:
         return magnitude_n
 
     def make_goal(self) -> TrialGoal:
-        """Creates the goal of the trial, which computes the target and decides on the end.
+        """Creates the goal of the trial: its target, and the rule for when it ends.
 
-        Each judge of the trial needs a goal of its own, because a goal stores the time since
-        which the end effector has been in the target.
+        A goal stores when the end effector entered the target, so each judge of the trial needs
+        its own goal.
         """
         planned = self.planned
         task = self.protocol.task
@@ -299,16 +292,16 @@ class ExperimentTrial:
         return goal
 
     def settle(self, path: Path) -> TrialEntry:
-        """Verifies the log of the trial, and returns the trial's result computed from it.
+        """Verifies the log of the trial and computes the result from it.
 
-        The run is executed again from the log. The result is valid only if the records are the
-        same.
+        The run is repeated from the log, and the result is valid only if the records are
+        identical.
 
         Args:
             path: Path of the log.
 
         Raises:
-            LogError: The records cannot be reproduced, or they end before the trial does.
+            LogError: The records cannot be reproduced, or end before the trial does.
         """
         log = open_log(path)
         if not verify_log(log).passed:
@@ -514,10 +507,10 @@ class ExperimentTrial:
 
 
 class SyntheticTrial(ExperimentTrial):
-    """A trial in which models of people (synthetic participants) move the master arms.
+    """A trial in which synthetic participants (models of people) move the master arms.
 
-    It runs in virtual time, without a network, in less time than the trial lasts. It is used to
-    test a protocol and its analysis before people take part.
+    Runs in virtual time, without a network, and faster than real time. Used to test a protocol
+    and its analysis before people take part.
     """
 
     people = False
@@ -572,12 +565,12 @@ class SyntheticTrial(ExperimentTrial):
         return self.protocol.model.draw(participant_seed)
 
     def find_end_s(self) -> float:
-        """Returns the duration of the trial, from a fast simulation that writes no log.
+        """Runs a fast simulation with no log to determine when the trial ends, in s.
 
-        A second run then writes the log, and ends soon after that time.
+        The run that writes the log then stops shortly after that time.
 
         Returns:
-            The end of the trial, in s since the start of the session.
+            End of the trial, in s since the start of the session.
         """
         scenario = self.scenario
         judge = TrialJudge(self)
@@ -616,10 +609,10 @@ class SyntheticTrial(ExperimentTrial):
         return self.longest_s
 
     def write(self, path: Path) -> TrialEntry:
-        """Simulates a trial with a model of the participant, and writes its log.
+        """Simulates the trial, writes its log and returns its result.
 
-        A first run without a log determines when the trial ends, so that the log stops soon
-        after. The result of the trial is returned.
+        A first run with no log determines when the trial ends, so the log stops shortly
+        afterwards.
 
         Args:
             path: Path of the log.
@@ -640,14 +633,13 @@ class SyntheticTrial(ExperimentTrial):
 
     @staticmethod
     def run_task(task: tuple[ExperimentProtocol, str, PlannedTrial, str, Path]) -> TrialEntry:
-        """Runs a trial of synthetic participants, models of people, and keeps its log.
+        """Runs a trial with synthetic participants in a worker process, and keeps its log.
 
-        Worker processes call this method. All inputs are in one argument, because it is sent
-        to the worker as a whole.
+        Takes a single argument, which is sent to the worker.
 
         Args:
-            task: The protocol of the experiment, the text of the scenario, the planned trial,
-                the digest that identifies the plan of all trials, and the folder of the log.
+            task: The protocol of the experiment, the source of the scenario, the planned trial,
+                the digest of the plan, and the folder for the log.
 
         Returns:
             The result of the trial.

@@ -1,6 +1,6 @@
-"""Shows a running session of several arms on web pages, on which people can also take part.
+"""Shows a running session on web pages, through which people can also take part.
 
-`page_server` is the server of the pages, `terminal_watch` shows a session in a terminal
-instead, and `experiment_sessions` conducts experiments, in which several sessions are shown one
-after the other on the same pages.
+`page_server` serves the pages, `terminal_watch` shows a session in a terminal instead, and
+`experiment_sessions` conducts experiments, in which the same pages show several sessions one
+after another.
 """

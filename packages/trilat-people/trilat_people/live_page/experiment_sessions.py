@@ -1,16 +1,16 @@
 """Conducts an experiment with people: one live session per trial, on the same browser pages.
 
-The participants open their pages once. For each trial, one execution of a task, this module
-starts a session, shows it on the pages of the experimenter and the participants, checks the
-recorded log, and writes the result to the journal of the experiment. Between trials it collects
-consents and questionnaires.
+The participants open their pages once. For each trial, this module starts a session, shows it
+on the pages of the experimenter and the participants, verifies the recorded log, and writes the
+result to the journal of the experiment. Between trials, it collects consents and
+questionnaires.
 
 Invariant:
     - A trial counts only if its log exists and is valid. The log is moved to its final path
       before the trial is added to the journal. If this process dies at any moment, no completed
-      trial is lost, and no incomplete trial is counted.
-    - Every attempt at a trial has its own folder. If the attempt does not count, its folder is
-      kept, together with a note of the reason.
+      trial is lost and no incomplete trial is counted.
+    - Every attempt at a trial has its own folder. If an attempt does not count, its folder is
+      kept together with a note of the reason.
 """
 
 import shutil
@@ -57,17 +57,17 @@ True once the session may begin.
 
 @dataclass
 class ExperimentSessions:
-    """Runs the remaining steps of an experiment with people, one after another.
+    """Runs the remaining steps of an experiment with people, one at a time.
 
-    The steps are consents, questionnaires and trials. Each trial runs in a session of its own.
+    Steps are consents, questionnaires and trials. Each trial runs in its own session.
 
     Attributes:
         experiment: The experiment, with its plan and the journals of completed steps.
-        stage: Controls the content of the pages between the sessions, and collects the
-            participants' replies.
+        stage: Controls the content of the pages between sessions and collects the participants'
+            replies.
         clock: Clock of this process.
         run_session: Function that runs the session of a trial.
-        ends: Function that returns True once the experiment must end for now.
+        ends: Function that returns True once the experiment must be interrupted.
         say: Function that prints a line for the user.
     """
 
@@ -79,16 +79,15 @@ class ExperimentSessions:
     say: Callable[[str], None]
 
     def run(self) -> bool:
-        """Runs the remaining steps. Steps that were completed earlier are skipped.
+        """Runs the remaining steps and skips those already completed.
 
-        A step is a trial or a questionnaire. An experiment may be interrupted and continued on
-        another day.
+        An experiment can be interrupted and resumed on another day.
 
         Returns:
-            True if all steps are completed. False if the experiment was ended earlier.
+            True if all steps have been completed, False if the experiment was interrupted.
 
         Raises:
-            LogRefused: A file could not be written to the disk. All results so far are kept.
+            LogRefused: A file could not be written to disk. All results so far are kept.
             UsageError: The experiment has synthetic participants.
         """
         trials = self.experiment.open_trials(people=True)
@@ -291,10 +290,10 @@ class ExperimentSessions:
         has_begun = False
 
         def begins() -> bool:
-            """Returns True once all participants have said that they are ready.
+            """Returns True once all participants have confirmed that they are ready.
 
-            They confirm this on their web pages. The session waits for the confirmations before
-            its first control period. Then the pages show the trial.
+            They confirm this on their pages. The session waits for the confirmations before its
+            first control period, and the pages then show the trial.
             """
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
@@ -384,9 +383,9 @@ def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
 def run_with_people(
     experiment: Experiment, options: PageOptions, say: Callable[[str], None]
 ) -> int:
-    """Continues an experiment with people, from its first step that is not completed.
+    """Resumes an experiment with people at its first incomplete step.
 
-    The experiment is shown on web pages, one for each participant and one for the experimenter.
+    The experiment is shown on web pages, one per participant and one for the experimenter.
 
     Args:
         experiment: The experiment, with its plan and the journals of completed steps.
@@ -394,10 +393,10 @@ def run_with_people(
         say: Function that prints a line for the user.
 
     Returns:
-        The exit code of the command.
+        Exit code of the command.
 
     Raises:
-        LogRefused: A file could not be written to the disk. All results so far are kept.
+        LogRefused: A file could not be written to disk. All results so far are kept.
         UsageError: The experiment has synthetic participants.
     """
     clock = SystemClock()
@@ -412,20 +411,19 @@ def run_with_people(
             def run_session(
                 watch: TrialWatch, folder: Path, begins: Callable[[], bool]
             ) -> SessionResult:
-                """Runs the session of one trial, and shows it on the experiment's web pages.
+                """Runs the session of one trial and shows it on the pages of the experiment.
 
-                A trial is one execution of the experiment's task. The function uses the server
-                `page` of the web pages, the network connection `idle` that the pages observe
-                between the sessions, and the signal handler `interrupt` of the experiment. If a
-                signal ends the session, for example Ctrl-C, the whole experiment ends too.
+                Uses the page server `page`, the network connection `idle` that the pages
+                observe between sessions, and the signal handler `interrupt` of the experiment.
+                A signal that ends the session, such as Ctrl-C, also ends the experiment.
 
                 Args:
-                    watch: The trial and its present state.
+                    watch: The trial and its current state.
                     folder: Folder for the log and for the output of the processes.
-                    begins: Function that returns True once the session may begin.
+                    begins: Function that returns True once the session may start.
 
                 Returns:
-                    The result of the session, which contains the path of its log.
+                    Result of the session, including the path of its log.
                 """
                 # `run_demo` passes the remaining arguments: the session and its addresses.
                 show_session_on_pages = partial(_show_session, page, idle, watch)
@@ -442,7 +440,7 @@ def run_with_people(
                 return result
 
             def ends() -> bool:
-                """Returns True once Ctrl-C or an experimenter's page has requested to stop."""
+                """Returns True once Ctrl-C or an experimenter's page has requested a stop."""
                 return interrupt.is_requested() or page.end_requested.is_set()
 
             sessions = ExperimentSessions(

@@ -1,19 +1,17 @@
 """Controls the content of an experiment's pages: consent, readiness, trials, questionnaires.
 
-A trial is one execution of a task by the participants, in a session of its own. The `Stage`
-requests the steps between the trials from the users and collects their replies. A `TrialWatch`
-judges a trial while its session runs.
+`Stage` asks the users to complete the steps between trials and collects their replies.
+`TrialWatch` judges a trial while its session runs.
 
 Invariant:
-    - A reply counts only for the step that the page showed, and only from the first page of a
+    - A reply counts only for the step shown on the page, and only from the first page of a
       user's site.
-    - A trial is judged by every record of the slave arm, the arm that follows the users. A
-      record is the stored result of one period of its control loop. The later evaluation of the
-      log uses the same records.
-    - Rests of the users and absences of pages are measured on the monotonic clock, which is
-      never set, so a correction of the time of day does not change any duration.
+    - A trial is judged by every record of the slave arm. The later evaluation of the log uses
+      the same records.
+    - Rests of users and absences of pages are measured on the monotonic clock, so adjusting the
+      time of day does not affect any duration.
     - The pages of users never show the condition of the experiment, such as the delay or the
-      control law, because this knowledge could influence the users.
+      control law, since this could influence the users.
 """
 
 from collections.abc import Collection, Sequence
@@ -47,8 +45,7 @@ Json = dict[str, Any]
 class TrialWatch:
     """Decides during a trial whether it succeeds, fails or must be repeated.
 
-    A trial is one execution of a task by the participants, in a session of its own. The pages
-    call `poll` many times a second while the session runs.
+    The pages call `poll` many times per second while the session runs.
 
     Args:
         trial: The trial, with its task and the names of its sites.
@@ -56,9 +53,9 @@ class TrialWatch:
 
     Attributes:
         trial: The trial.
-        judge: Evaluates the records of the slave arm, one after another, and finds the outcome.
-        aborted: Reason why the trial must be repeated. Empty if it need not be repeated.
-        diverged: True if an arm has exceeded a safety limit, which makes the trial fail.
+        judge: Evaluates the records of the slave arm and determines the outcome.
+        aborted: Reason why the trial must be repeated. Empty otherwise.
+        diverged: True if an arm exceeded a safety limit, in which case the trial fails.
     """
 
     def __init__(self, trial: ExperimentTrial, clock: Clock) -> None:
@@ -73,9 +70,9 @@ class TrialWatch:
 
     @property
     def over(self) -> bool:
-        """True once the session in which a trial takes place can end.
+        """True once the session of the trial can end.
 
-        After an abort, the session can end at once. After the outcome, it continues for
+        After an abort, the session can end immediately. After the outcome, it continues for
         `END_DELAY_NS`, so that the log contains the motion after the trial.
         """
         if self.aborted:
@@ -84,20 +81,18 @@ class TrialWatch:
         return has_outcome and self._clock.monotonic_ns() - self._ended_ns > END_DELAY_NS
 
     def poll(self, view: SessionView, absent: Collection[str]) -> list[str]:
-        """Judges the trial from new records of the slave arm, and finds reasons to repeat it.
+        """Judges the trial from new records of the slave arm, and detects reasons to repeat it.
 
-        A record contains the measurements and results of an arm's process in one control
-        period. The trial must be repeated if an arm was stopped, or if the web page of a
-        participant has disappeared. The records are then not judged.
+        The trial must be repeated if an arm was stopped, or if the web page of a participant
+        has disappeared. In that case, the records are not judged.
 
         Args:
-            view: Present state of the session.
-            absent: Sites (processes, one per arm) whose participant's page has been missing for
-                too long.
+            view: Current state of the session.
+            absent: Sites whose participant's page has been missing for too long.
 
         Returns:
-            Texts to write into the log as events at the present time. Empty if nothing has
-            happened, or if the trial has ended.
+            Messages to write into the log as events at the current time. Empty if nothing has
+            happened or the trial has ended.
         """
         if self.over or self.judge.outcome is not None or not view.running:
             return []
@@ -158,19 +153,18 @@ class TrialWatch:
         return log_marks
 
     def describe(self, t_s: float, site: str) -> Json:
-        """Describes the target that the participants must reach now, for a page.
+        """Describes for a page the target that the participants must currently reach.
 
-        The description also states whether the target has appeared.
+        Also states whether the target has appeared.
 
         Args:
-            t_s: Time of the pose that the page shows, since the start of the trial's session,
-                in s.
-            site: Name of the site of the page's user. If it is empty, the target lies in the
-                middle of the targets of all users.
+            t_s: Time of the pose shown on the page, in s since the start of the session.
+            site: Name of the site of the page's user. If empty, the target is the midpoint of
+                all users' targets.
 
         Returns:
             Position and width of the target, the corridor to it if there is one, and the
-            remaining time, as plain values for JSON.
+            remaining time, as JSON-compatible values.
         """
         goal = self.judge.goal
         trial = self.trial
@@ -211,23 +205,22 @@ class _StepRequest:
 
 
 class Stage:
-    """Decides the content of an experiment's web pages before, during and after each trial.
+    """Determines the content of an experiment's web pages before, during and after trials.
 
-    In an experiment, people move robot arms over a network. Each trial is a session of its own.
-    Between trials, the participants complete steps on their pages, such as a questionnaire. The
-    program that conducts the experiment calls `request_step` and `show_trial`. The server of
-    the pages runs in another thread. It calls `describe` for the content of a page, `accept`
-    for a reply of a participant, and `poll` regularly.
+    Each trial is a session of its own. Between trials, the participants complete steps on their
+    pages, such as a questionnaire. The program that conducts the experiment calls
+    `request_step` and `show_trial`. The page server, which runs in another thread, calls
+    `describe` for the content of a page, `accept` for the reply of a participant, and `poll`
+    regularly.
 
     Args:
         plan: Plan of the experiment.
         clock: Clock of this process.
 
     Attributes:
-        users: Names of the sites (processes, one per arm) whose arms the participants hold.
+        users: Names of the sites whose arms the participants hold.
         shows_ages: True if the pages initially show the ages of the displayed poses of the
-            other arms. It is False in a staircase, a procedure that asks participants for
-            differences, because the ages could reveal the answer.
+            other arms. False in a staircase, where the ages could reveal the answer.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
@@ -246,17 +239,17 @@ class Stage:
     def request_step(
         self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()
     ) -> _StepRequest:
-        """Asks the users on their pages to complete a step, such as a questionnaire.
+        """Asks users on their pages to complete a step, such as a questionnaire.
 
-        The experiment waits for all users, and then continues with the next step.
+        The experiment waits for all users before continuing with the next step.
 
         Args:
             step: The step.
-            rest_s: Time that the users must rest before the step, in s.
-            done: Sites of the users who have completed the step already.
+            rest_s: Minimum rest of the users before the step, in s.
+            done: Sites of the users who have already completed the step.
 
         Returns:
-            The request, in which the replies of the users are collected.
+            The request, which collects the replies of the users.
         """
         rest_end_ns = self._clock.monotonic_ns() + int(rest_s * NS_PER_S)
         request = _StepRequest(step, rest_end_ns)
@@ -272,25 +265,24 @@ class Stage:
         """Shows on all open web pages that a trial is about to begin.
 
         Args:
-            watch: Object that judges the trial while its session runs.
+            watch: Judge of the trial while its session runs.
         """
         self._request = None
         self._watch = watch
         self._phase = "starting"
 
     def show_checking(self) -> None:
-        """Shows on all open web pages that a trial has ended, and that its log is checked."""
+        """Shows on all open web pages that a trial has ended and its log is being verified."""
         self._watch = None
         self._phase = "checking"
 
     def show_feedback(self, entry: TrialEntry | None, why: str = "") -> None:
         """Shows the participants the result of a trial, or why the trial must be repeated.
 
-        Participants see only those measures of the trial that the protocol of the experiment
-        selects.
+        Participants see only the measures that the protocol of the experiment selects.
 
         Args:
-            entry: Result of the trial. `None` if the trial must be repeated.
+            entry: Result of the trial, or `None` if the trial must be repeated.
             why: Reason for the repetition.
         """
         self._feedback = {"why": why, "measures": {}}
@@ -309,17 +301,18 @@ class Stage:
         self._phase = "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
-        """Evaluates the new records of a trial, and records which users have an open page.
+        """Evaluates the new records of a trial and updates which users have an open page.
 
-        The server of the pages calls this method many times a second.
+        Called by the page server many times per second.
 
         Args:
-            view: Present state of the session.
-            pages: For each open page of a user, the name of the user's site and the number of
-                the page.
+            view: Current state of the session.
+            pages: One pair per open page of a user: the name of the user's site and the number
+                of the page.
 
         Returns:
-            Texts that mark this moment in the log. Empty if no trial is running.
+            Messages to write into the log as events at the current time. Empty if no trial is
+            running.
         """
         now_ns = self._clock.monotonic_ns()
         request = self._request
@@ -350,7 +343,7 @@ class Stage:
         return self._watch.poll(view, absent_sites)
 
     def accept(self, site: str, page: int, message: StageMessage) -> bool:
-        """Processes a message of a participant's web page, such as answers to a questionnaire.
+        """Processes a message from a participant's page, such as questionnaire answers.
 
         Args:
             site: Name of the user's site. Empty for an experimenter.
@@ -358,8 +351,8 @@ class Stage:
             message: The message.
 
         Returns:
-            True if the message was accepted. False if it was not requested from that page and
-            has no effect.
+            True if the message was accepted, False if it was not requested from that page and
+            is ignored.
         """
         is_holder = self._holders.get(site) == page
         if isinstance(message, AbortTrial):
@@ -399,19 +392,20 @@ class Stage:
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Describes the present content of a page of the experiment.
+        """Describes the current content of a page of the experiment.
 
-        The server of the page calls this for each message that it sends to the page.
+        Called by the page server for each message that it sends to the page.
 
         Args:
             role: Role of the page's user: experimenter, user of one arm, or watcher.
-            site: Name of the site of the page's user. Empty if the page belongs to no user.
+            site: Name of the site of the page's user. Empty if the page does not belong to a
+                user of an arm.
             page: Number of the page.
-            t_s: Time of the pose that the page shows, in s. `None` if it shows no arms.
+            t_s: Time of the pose shown on the page, in s, or `None` if the page shows no arms.
 
         Returns:
-            The present phase, the requested step, the task, the users and further facts that
-            the role may see, as plain values for JSON.
+            The current phase, the requested step, the task, the users and whatever else the
+            role may see, as JSON-compatible values.
         """
         step = self._step
         request = self._request

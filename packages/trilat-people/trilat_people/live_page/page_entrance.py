@@ -1,15 +1,14 @@
-"""Limits the number of connections that the server of the web pages keeps open.
+"""Limits the number of connections that the page server keeps open.
 
-People watch and control the robot arms of a session on web pages. A new connection is called a
-stranger until the server knows the role of its user: experimenter, user of one arm, or watcher.
-After that, it is called a page. The server limits the numbers of strangers and pages, so that
-nobody can block others by opening many connections.
+A new connection is called a stranger until the server knows the role of its user: experimenter,
+user of one arm, or watcher. From then on, it is called a page. Limiting the number of strangers
+and pages prevents anybody from blocking others by opening many connections.
 
 Invariant:
     - Silent or slow connections and downloads count as strangers. If there are too many
       strangers, the oldest is closed to admit a new connection.
-    - The number of pages is limited separately for each role, so that many watchers cannot
-      displace other roles.
+    - The number of pages is limited separately for each role, so many watchers cannot displace
+      other roles.
     - A new page of an experimenter or a user is always accepted. If there are too many, the
       oldest page with the same role is closed. A page on which an experimenter controls the
       session is closed only if all experimenters' pages control it.
@@ -30,13 +29,14 @@ MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
 
 
 class Strangers:
-    """The open connections of strangers, whose role is not known yet.
+    """Open connections whose role is not known yet.
 
-    Their number is limited. If there are too many, the oldest is closed, so that nobody can
-    block others with many silent connections.
+    Their number is limited. If there are too many, the oldest is closed, so nobody can block
+    others with many silent connections.
 
     Args:
-        refused: Number of refusals by reason. Connections that are closed here are added.
+        refused: Mapping from reason to number of refusals, to which connections closed here are
+            added.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
@@ -45,7 +45,7 @@ class Strangers:
         self._refused = refused
 
     def add(self, connection: ServerConnection) -> None:
-        """Adds a new connection. If there are too many, the oldest is closed and counted.
+        """Adds a new connection, closing and counting the oldest one if there are too many.
 
         The oldest connection has had the most time to prove its role, so a flood of connections
         cannot block new ones.
@@ -61,9 +61,9 @@ class Strangers:
         self._connections[connection] = None
 
     def remove(self, connection: ServerConnection) -> None:
-        """Removes a connection that was closed, or whose web page has proved its role.
+        """Removes a connection that was closed or whose page has proved its role.
 
-        If the connection is not in the list, nothing happens.
+        Does nothing if the connection is not a stranger.
         """
         self._connections.pop(connection, None)
 
@@ -88,7 +88,7 @@ Page = TypeVar("Page", bound=_SeatedPage)
 
 
 def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
-    """Returns the open page that must be closed before another page can be opened.
+    """Returns the open page that must be closed to admit a new page.
 
     The number of pages is limited for each role: experimenter, user of an arm, or watcher. The
     oldest page of the role is closed.
@@ -98,7 +98,7 @@ def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
         role: Role of the new page.
 
     Returns:
-        The page to close. `None` if there is room for the new page.
+        The page to close, or `None` if there is room for the new page.
     """
     role_pages = _list_pages_of_role(pages, role)
     if len(role_pages) < MAX_PAGES[role.kind]:

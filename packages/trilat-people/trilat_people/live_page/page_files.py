@@ -1,11 +1,11 @@
 """Selects the files that the web server sends: the page and the results.
 
-The results are the log of the session and the report that is computed from it. They are offered
-for download on the page when the session has ended.
+The results are the log of the session and the report computed from it. They are offered for
+download on the page once the session has ended.
 
 Invariant:
     - A page runs only scripts from its own server. A report runs its own scripts, isolated from
-      the page, because it may come from somebody else's log.
+      the page, since it may come from somebody else's log.
     - Nobody can guess the address of a report or a log.
 """
 
@@ -42,14 +42,14 @@ _POLICY = (
 
 
 class PageFiles:
-    """Provides the files that a server sends to browsers: the web page and the results.
+    """Files that the server sends to browsers: the web page and the results.
 
-    The results are the report and the log of the session. They are available only after the
+    The results are the report and the log of the session. They become available after the
     session, at addresses that nobody can guess.
 
     Attributes:
-        results: Path of each result on the disk, by the path in its web address. Empty while
-            the session runs.
+        results: Mapping from the path in the web address of each result to its path on disk.
+            Empty while the session runs.
     """
 
     def __init__(self) -> None:
@@ -57,26 +57,26 @@ class PageFiles:
         self.results: dict[str, Path] = {}
 
     def add_results(self, paths: Iterable[Path]) -> None:
-        """Offers the report and the log of an ended session for download in the browser.
+        """Offers the report and log of an ended session for download.
 
-        Each call uses a new secret in the addresses. Files above `MAX_FILE_BYTES` are left out.
+        Each call uses a new secret in the addresses. Files larger than `MAX_FILE_BYTES` are
+        skipped.
 
         Args:
-            paths: The files.
+            paths: Paths of the files.
         """
         secret = secrets.token_urlsafe()
         sendable = (path for path in paths if path.stat().st_size <= MAX_FILE_BYTES)
         self.results |= {f"/{secret}/{path.name}": path for path in sendable}
 
     def find(self, path: str) -> Response | None:
-        """Returns the response of the web server to a browser's request for a file.
+        """Returns the HTTP response to a browser's request for a file.
 
         Args:
             path: Path of the requested address.
 
         Returns:
-            The response of the server, with the content of the file. `None` if there is no such
-            file.
+            The response with the content of the file, or `None` if there is no such file.
         """
         result = self.results.get(path)
         if result is not None and result.is_file():

@@ -1,13 +1,12 @@
 """Opens a browser at a link that contains a secret token.
 
-The link leads to the page on which people watch and control a session of robot arms. Anybody
-who knows the token can take part in the session, so other users of the same machine must not
-see it.
+The link leads to the page on which people watch and control a session. Anybody who knows the
+token can take part in the session, so other users of the same machine must not see it.
 
 Invariant:
-    - The token never appears in a command line, because every user of the machine can list
+    - The token never appears on a command line, since every user of the machine can list
       command lines.
-    - The browser opens a file that only its user can read, and that redirects to the link. The
+    - The browser opens a file that only its user can read and that redirects to the link. The
       file is removed once the page is open.
 """
 
@@ -37,8 +36,8 @@ class BrowserOpening:
     def open(self) -> None:
         """Opens a browser at the secret link of a page, through a file that redirects to it.
 
-        If there is no browser, or the file cannot be written, nothing happens, because the link
-        is also printed for the user.
+        Does nothing if there is no browser or the file cannot be written, since the link is
+        also printed for the user.
         """
         # A RuntimeError means that the user has no home directory.
         with suppress(OSError, webbrowser.Error, RuntimeError):
@@ -47,11 +46,11 @@ class BrowserOpening:
     def write(self) -> Path:
         """Writes an HTML file that redirects a browser to the secret link of the page.
 
-        Only the user can read the file. It is in a new folder in the home directory, because a
-        browser that was installed as a snap can read neither /tmp nor hidden folders.
+        Only the user can read the file. It is placed in a new folder in the home directory,
+        since a browser installed as a snap can read neither /tmp nor hidden folders.
 
         Returns:
-            The path of the file.
+            Path of the file.
 
         Raises:
             OSError: The file cannot be written.
@@ -67,9 +66,9 @@ class BrowserOpening:
         return file
 
     def remove_file(self) -> None:
-        """Removes the temporary file with the secret link of a page.
+        """Removes the temporary file that holds the secret link of a page.
 
-        The method is called once the browser has opened the page, or when the server ends.
+        Called when the browser has opened the page or the server shuts down.
         """
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)

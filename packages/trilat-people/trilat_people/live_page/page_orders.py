@@ -1,21 +1,20 @@
-"""Defines the requests that a web page may send, and passes them to the robot arms.
+"""Defines the requests that a web page may send, and forwards them to the sites.
 
-People watch and control a running session on web pages. The role of a person is experimenter,
-user of one arm, or watcher. The server of the pages reads each message of a page with
-`PageMessage.read`, and checks with `Role.may` that the role permits it. `PageHands` then moves
-the arms that the person holds. `OrderDesk` sends other requests to the sites, the processes
-that each control one arm, and receives their replies.
+The role of a person at a page is experimenter, user of one arm, or watcher. The page server
+parses each message with `PageMessage.read` and checks with `Role.may` whether the role permits
+it. `PageHands` moves the arms that the person holds. `OrderDesk` sends other requests to the
+sites and receives their replies.
 
 Invariant:
-    - A valid message has one of the types below, finite numbers in range, and names that the
-      session contains. Any other message, and any message that exceeds the rate of its type, is
+    - A valid message has one of the types below, finite numbers in range, and names that exist
+      in the session. Any other message, and any message that exceeds the rate of its type, is
       counted and dropped.
     - If several waiting requests change the same network link, only the newest is sent. The
-      same applies to the weights with which a site follows the other arms.
+      same applies to the dominance factors of a site.
     - Only one request at a time waits for the reply of a site. A request to stop the arm does
-      not wait, but is sent at once, and every role may send it.
-    - The address of a page contains a secret token, which grants a role and, to a user, a site.
-      The rest of the address may lower the role, but never raise it.
+      not wait but is sent immediately, and every role may send it.
+    - The address of a page contains a secret token, which grants a role and, for a user, a
+      site. The rest of the address may lower the role but never raise it.
 """
 
 import hmac
@@ -68,22 +67,21 @@ class PageMessage(
 ):
     """Base class of the messages that a page sends to its server.
 
-    The field `do` of the JSON text names the kind of message, for example {"do": "mark",
-    "text": "contact"}. Unknown fields are rejected.
+    The JSON field `do` contains the kind of message, for example {"do": "mark", "text":
+    "contact"}. Unknown fields are rejected.
     """
 
     @staticmethod
     def read(text: str | bytes) -> "PageMessage":
-        """Decodes a message that a page sent, and checks the range of its numbers.
+        """Decodes and validates a message from a page.
 
-        The content of a message may come from anybody, and must be checked before it moves an
-        arm.
+        The message may come from anybody, so it must be validated before it moves an arm.
 
         Args:
             text: The message as JSON.
 
         Returns:
-            The message, of the class that its field `do` names.
+            The message, of the class given by its field `do`.
 
         Raises:
             WireError: The text is not a valid message, or a number is out of range.
@@ -97,9 +95,9 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """Message of a web page that it has drawn a frame, so that the next frame can be sent.
+    """Acknowledgement by a page that it has drawn a frame and is ready for the next one.
 
-    The server describes the present state of the session in messages called frames.
+    A frame is a message in which the server describes the current state of the session.
 
     Attributes:
         n: Number of the frame that was drawn.
@@ -109,10 +107,10 @@ class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """Request of a web page to receive or return the right to move arms and change settings.
+    """Request of a page to obtain or give up the right to move arms and change settings.
 
     Attributes:
-        want: True to ask for the right, False to return it.
+        want: True to request the right, False to give it up.
     """
 
     want: bool
@@ -121,12 +119,12 @@ class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
 class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
     """Reply of a page to another page that has asked for control of the session.
 
-    A page with control may move arms and change settings. The pages that hold an arm at present
-    must allow another page to take part.
+    A page with control may move arms and change settings. The pages that currently hold an arm
+    must agree before another page may take part.
 
     Attributes:
-        page: Number of the page that asks.
-        yes: True to allow it, False to refuse.
+        page: Number of the page that asked.
+        yes: True to agree, False to refuse.
     """
 
     page: Count
@@ -134,9 +132,9 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """Request of a web page to stop all arms at once. Everybody may send it, even a watcher.
+    """Request of a page to stop all arms immediately. Anybody may send it, even a watcher.
 
-    The session continues: the arms rest until somebody releases them.
+    The session continues, and the arms rest until somebody releases them.
     """
 
 
@@ -193,9 +191,9 @@ class _MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
 
 
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
-    """Request of a page to show or hide the age of displayed poses on the pages of users.
+    """Request of a page to show or hide the ages of displayed poses on the pages of users.
 
-    The network delays the users' view of the other arms. The age is this delay.
+    The age is the delay with which a user sees another arm over the network.
 
     Attributes:
         shown: True to show the ages, False to hide them.
@@ -205,13 +203,13 @@ class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
 
 
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
-    """Request of a web page to take hold of an arm, to move it, or to release it.
+    """Request of a page to take hold of an arm, to move it, or to release it.
 
     Attributes:
-        site: Name of the process ("site") that controls the arm.
+        site: Name of the site of the arm.
         grip: True to hold the arm, False to release it.
         to: Target to which the arm is pulled: the position of the end effector in m, or the
-            joint positions in rad. For an arm that is pushed instead, it is the force in N.
+            joint positions in rad. For an arm that is pushed, the force in N.
     """
 
     site: Name
@@ -220,21 +218,21 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """Request of a web page to end the session in an orderly way, so that its log is complete.
+    """Request of a page to end the session in an orderly way, so that its log is complete.
 
-    Only sessions that were started together with their page accept it.
+    Accepted only by sessions that were started together with their page.
     """
 
 
 class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
-    """Message of a page that its user has completed a step of an experiment.
+    """Notification from a page that its user has completed a step of an experiment.
 
-    The user has agreed, is ready, or has answered a questionnaire.
+    The user has given consent, is ready, or has answered a questionnaire.
 
     Attributes:
         key: Key of the step, as the server sent it to the page.
-        answers: Answers to a questionnaire, in the order of its items. A missing answer is
-            `None`.
+        answers: Answers to a questionnaire, in the order of its items; `None` for a missing
+            answer.
     """
 
     key: Name
@@ -242,7 +240,7 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
-    """Request of a web page to end the running trial of an experiment, and to repeat it later.
+    """Request of a page to abort the running trial of an experiment and repeat it later.
 
     Attributes:
         why: The reason, for the journal of the experiment.
@@ -290,9 +288,9 @@ class _TokenBucket:
 
 
 class MessageLimits:
-    """Limits how many messages a web page may send, per kind of message and in total.
+    """Limits how many messages a page may send, per kind of message and in total.
 
-    A page that sends more messages than a person can cause is faulty or hostile. The excess
+    A page that sends more messages than a person can cause is faulty or hostile. Excess
     messages are dropped.
     """
 
@@ -302,17 +300,17 @@ class MessageLimits:
             self._buckets[kind] = _TokenBucket(float(burst))
 
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
-        """Returns True if a message of a page is within the allowed rate, and counts it.
+        """Counts a message, and returns True if it is within the permitted rate.
 
-        The rate is limited by the method of the token bucket: each message needs a token, and
-        tokens are added at the allowed rate, up to the largest burst.
+        The rate is limited with a token bucket: each message takes a token, and tokens are
+        replenished at the permitted rate, up to the largest burst.
 
         Args:
             kind: Kind of the message.
-            now_ns: Present time on the monotonic clock, in ns.
+            now_ns: Current time on the monotonic clock, in ns.
 
         Returns:
-            False if the page has sent too many messages, and this message must be dropped.
+            False if the page has sent too many messages and this one must be dropped.
         """
         if kind not in _RATES:
             return True
@@ -334,26 +332,26 @@ class MessageLimits:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """The rights of a person at a web page, and the arm whose user's view the page shows.
+    """Rights of a person at a web page, and the site whose view the page shows.
 
     Attributes:
-        kind: An experimenter may do everything, a user may hold the arm of one site, and a
-            watcher may only stop the arms.
-        site: Name of the site whose user's view is shown, in which the other arms have their
-            delay. Empty to show all arms without delay.
+        kind: Kind of role. An experimenter may do everything, a user may hold the arm of one
+            site, and a watcher may only stop the arms.
+        site: Name of the site whose user's view is shown, with delayed poses of the other arms.
+            Empty to show all arms with no delay.
     """
 
     kind: Literal["experimenter", "user", "watcher"] = "experimenter"
     site: str = ""
 
     def may(self, message: PageMessage) -> bool:
-        """Returns True if a person with this role has the right to send a message.
+        """Returns True if a person with this role may send a message.
 
         An experimenter may send every message. A user may move their own arm, and reply in an
         experiment. Everybody may stop the arms.
 
         Args:
-            message: The message of the person's web page.
+            message: The message from the person's web page.
         """
         if self.kind == "experimenter":
             return True
@@ -367,7 +365,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """Name of a web page's user in events of the session, such as "the user of m1"."""
+        """How session events refer to the user of a web page, for example "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -376,10 +374,10 @@ class Role:
 
     @property
     def query(self) -> str:
-        """Part of a web page's address that states the role of its user, such as "as=m1".
+        """Part of a web page's address that gives the role of its user.
 
-        "as=m1" is the role of the user of the arm m1, and "watch" is the role of a watcher. The
-        text is empty for an experimenter.
+        "as=m1" for the user of the arm m1, "watch" for a watcher, and empty for an
+        experimenter.
         """
         fields: list[str] = []
         if self.kind == "watcher":
@@ -390,18 +388,18 @@ class Role:
 
 
 class RoleLinks:
-    """Creates the links that open a page, and determines the role that a link grants.
+    """Creates the links that open a page and determines the role granted by a link.
 
-    A link contains a secret token, so that only those who received it can open the page. A
-    token is needed on this machine too, because other users of the machine can connect. The
-    token of a role is computed from a random secret, so it need not be stored.
+    A link contains a secret token, so only those who received the link can open the page. The
+    token is required even on this machine, since other users of the machine can connect. The
+    token of a role is derived from a random secret and need not be stored.
     """
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(TOKEN_BYTES)
 
     def link(self, address: str, role: Role) -> str:
-        """Creates the link that opens the page of a role.
+        """Creates the link that opens the page for a role.
 
         The secret token is in the fragment of the link, the part after #, which a browser does
         not send to other servers.
@@ -415,16 +413,15 @@ class RoleLinks:
         return f"{address}{query}#token={token}"
 
     def find(self, query: str) -> Role | None:
-        """Returns the role that a link grants to the page that was opened with it.
+        """Returns the role granted by the link with which a page was opened.
 
-        The link contains the secret token of its role. An experimenter may choose a lower role,
-        for example to see the view of an arm's user.
+        An experimenter may choose a lower role, for example to see the view of an arm's user.
 
         Args:
-            query: Query part of the page's request, with the token.
+            query: Query string of the page's request, including the token.
 
         Returns:
-            The role. `None` if the token does not belong to any role.
+            The role, or `None` if the token does not belong to any role.
         """
         fields = parse_qs(query, keep_blank_values=True)
         token = fields.get("token", [""])[0]
@@ -468,16 +465,16 @@ class RoleLinks:
 
 
 class PageHands:
-    """Moves the arms that the person at one page holds.
+    """Moves the arms held by the person at one page.
 
-    The messages of the page serve as a heartbeat: if they stop, for example because the page
-    was closed, the site releases the arm.
+    Messages from the page act as a heartbeat: if they stop, for example because the page was
+    closed, the site releases the arm.
 
     Args:
         bus: Network connection that reaches the session.
         clock: Clock of this process.
         session: Name of the session.
-        source: Name of the page, with which it introduces itself to the sites.
+        source: Name by which the page identifies itself to the sites.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, source: str) -> None:
@@ -489,14 +486,14 @@ class PageHands:
         self._held_sites: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
-        """Moves the arm of a site as the person at the page requests, or releases the arm.
+        """Moves or releases the arm of a site as requested by the person at the page.
 
-        A message with `grip` set holds the arm, and any other message releases it.
+        The arm is held if `grip` is set, and released otherwise.
 
         Args:
-            order: Message of the page, with the name of the site and the target or force.
-            pushes: True if the numbers are a force on the arm in N. False if they are a target
-                to which the arm is pulled, in m or rad.
+            order: Message from the page, with the name of the site and the target or force.
+            pushes: True if the message contains a force on the arm, in N; False if it contains
+                a target to which the arm is pulled, in m or rad.
         """
         site = order.site
         if site not in self._senders:
@@ -517,16 +514,16 @@ class PageHands:
         sender.move(self._source, grip=order.grip, **{field: numbers})
 
     def release(self) -> None:
-        """Releases all arms that the user of a web page moves.
+        """Releases all arms held by the user of the page.
 
-        This happens, for example, when the page is closed.
+        Called, for example, when the page is closed.
         """
         for site in list(self._held_sites):
             message = MoveHand(site=site, grip=False)
             self.move(message, pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
-        """Returns True if the user of this web page holds the arm of a site.
+        """Returns True if the user of this page holds the arm of a site.
 
         Args:
             site: Name of the site.
@@ -556,20 +553,19 @@ class _OpenQuery(NamedTuple):
 class OrderDesk:
     """Sends the requests of all pages to the sites, one at a time, and collects their replies.
 
-    A site is a process that controls one arm. A request changes, for example, the delay of a
-    link.
+    For example, a request may change the delay of a link.
 
     Args:
         bus: Network connection that reaches the session.
         clock: Clock of this process.
         session: Name of the session.
-        refused: Number of refused orders by reason, to which this object adds. If `None`, a new
-            count begins.
+        refused: Mapping from reason to number of refused orders, which is updated. If `None`, a
+            new mapping is created.
 
     Attributes:
         replies: Replies that have not been read yet. Each contains the name of the site, the
-            channel of the order, whether the site accepted it, and a text.
-        refused: Numbers of refused orders by reason.
+            channel of the order, whether the site accepted it, and a message.
+        refused: Mapping from reason to number of refused orders.
     """
 
     def __init__(
@@ -590,13 +586,13 @@ class OrderDesk:
     def accept(
         self, order: SiteOrder, sites: Collection[str], links: Collection[str], source: str = ""
     ) -> None:
-        """Queues the request of a page that changes the session, moves arms, or marks a moment.
+        """Queues a page's request to change the session, move arms, or mark a moment.
 
         Args:
             order: The request.
-            sites: Names of the sites of the session. The first one publishes a mark.
+            sites: Names of the sites of the session. Marks are published by the first one.
             links: Names of the links of the session.
-            source: Sender of the request, for the events in the log.
+            source: Sender of the request, as recorded in log events.
         """
         if isinstance(order, _SetLink | _SetShares):
             self._queue_change(order, sites, links, source)
@@ -645,13 +641,13 @@ class OrderDesk:
         self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
-        """Requests arm controllers (sites) to stop at once, ahead of all waiting requests.
+        """Asks sites to stop immediately, ahead of all waiting requests.
 
         Waiting requests that would release the same arms are withdrawn.
 
         Args:
             sites: Names of the sites.
-            source: Sender of the request, for the sites' events.
+            source: Sender of the request, as recorded in the sites' events.
         """
         stop = ChangeRequest(order="stop")
         request = _add_source(stop, source)
@@ -710,22 +706,21 @@ class OrderDesk:
         self._open_queries[site, channel] = _OpenQuery(inbox, sent_ns, request)
 
     def mark(self, site: str, text: str) -> None:
-        """Requests a site to publish an event with a text, which marks this moment in the log.
+        """Asks a site to publish an event that marks this moment in the log.
 
         Args:
             site: Name of the site that publishes the event.
-            text: The text, for example "trial 3 begins".
+            text: Label of the mark, for example "trial 3 begins".
         """
         subject = f"mark {text}"
         request = ChangeRequest(mark=text)
         self._enqueue(site, subject, request)
 
     def poll(self) -> None:
-        """Receives the replies of the sites to earlier requests, and sends requests that wait.
+        """Receives the sites' replies to earlier requests, and sends waiting requests.
 
-        The requests are changes of the session, for example a new delay. A site receives one
-        request at a time, and the next request after its reply. If a site does not reply in
-        time, an entry that states this is added to `replies`.
+        A site receives one request at a time, and the next one only after its reply. If a site
+        does not reply in time, an entry saying so is added to `replies`.
         """
         now_ns = self._clock.monotonic_ns()
         # A copy of the items, because answered requests are removed.

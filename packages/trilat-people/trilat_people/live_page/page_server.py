@@ -1,24 +1,24 @@
 """Serves the web page of a session: its files over HTTP, and its data over a WebSocket.
 
-A session is a run in which several processes ("sites") each control one robot arm. A page shows
-the arms while they move. Depending on its role it may also hold an arm, change the delay of
-links, or stop the arms. The server sends frames, which describe the present state, and receives
-messages of the page. It reads the messages that the sites exchange, as a recorder does.
+A page shows the arms while they move. Depending on its role, it may also hold an arm, change
+the delay of links, or stop the arms. The server sends frames, which describe the current state,
+and receives messages from the page. It reads the messages that the sites exchange, as a
+recorder does.
 
 The server runs in a thread of its own. The session neither waits for the server nor needs it:
 if the server fails, the session continues. In an experiment with people, the server shows one
-session after the other, and a `Stage` controls the steps around them. If the machine has a
+session after another, and a `Stage` controls the steps between them. If the machine has a
 browser, the server opens it.
 
 Invariant:
-    - A page receives a frame only when it has drawn an earlier frame. A slow page therefore
-      sees fewer frames, and no other part of the program waits for it. Each frame has the
-      newest state.
-    - Requests from pages of another web site, requests without a token, and messages that are
-      too many, too large or not allowed for the page's role are refused and counted. Their
+    - A page receives a new frame only after drawing an earlier one. A slow page therefore sees
+      fewer frames, and no other part of the program waits for it. Each frame has the newest
+      state.
+    - Requests from pages of another web site, requests with no token, and messages that are too
+      many, too large or not allowed for the role of the page are refused and counted. Their
       contents never reach a site.
-    - The number of pages of each role is limited, see `page_entrance`.
-    - One thread serves all pages and receives the session's messages. Therefore, no locks are
+    - The number of pages of each role is limited (see `page_entrance`).
+    - A single thread serves all pages and receives the messages of the session, so no locks are
       needed.
 """
 
@@ -150,31 +150,31 @@ class _Visitor(ServerConnection):
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Removes a closed connection from the strangers (connections without a role).
+        """Removes a closed connection from the strangers.
 
         Args:
-            exc: Error that closed the connection. `None` if it was closed normally.
+            exc: Error that closed the connection, or `None` if it was closed normally.
         """
         self.strangers.remove(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Processes data of the browser, and records that this connection has sent data.
+        """Processes data from the browser, and records that this connection has sent data.
 
-        Browsers open connections in advance and close some of them unused. The record
+        Browsers open some connections in advance and close them unused. The record
         distinguishes these from connections whose data were not a valid request.
 
         Args:
-            data: The received bytes.
+            data: The bytes received.
         """
         # Connections that browsers open in advance and close unused are not counted.
         self._has_received = True
         super().data_received(data)
 
     def send_data(self) -> None:
-        """Sends the waiting data to the browser, and counts connections that were refused.
+        """Sends pending data to the browser, and counts refused connections.
 
-        A connection is refused if the browser's data were not a valid request to open a
+        A connection is refused if the data from the browser were not a valid request to open a
         WebSocket. If the data were not even HTTP, the reply has the HTTP status 400.
         """
         problem = self.protocol.handshake_exc
@@ -250,15 +250,15 @@ class _Page:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """Command-line options that determine how a session's web page is served.
+    """Command-line options for serving the web page of a session.
 
     Attributes:
-        host: Address at which the server listens.
-        port: Port at which the server listens. If 0, any free port is chosen.
-        insecure: True if the user allows an address outside this machine without encryption.
-        opens: True to open a browser, if there is one.
-        tls: Folder with the keys of a member of the session, which are used for encryption. If
-            `None`, connections are not encrypted.
+        host: Address to listen on.
+        port: Port to listen on. If 0, any free port is used.
+        insecure: True to allow an unencrypted address outside this machine.
+        opens: True to open a browser if there is one.
+        tls: Folder with the keys of a member of the session, used for encryption. If `None`,
+            connections are not encrypted.
     """
 
     host: str = "127.0.0.1"
@@ -268,11 +268,11 @@ class PageOptions:
     tls: Path | None = None
 
     def make_context(self) -> ssl.SSLContext | None:
-        """Returns the TLS settings with which connections to browsers are encrypted.
+        """Returns the TLS context for connections to browsers.
 
         Returns:
-            The settings, with the certificate and the private key from the folder `tls`. `None`
-            if the connections are not encrypted.
+            The context with the certificate and private key from the folder `tls`, or `None` if
+            connections are not encrypted.
 
         Raises:
             UsageError: The keys cannot be used, for example because they have expired.
@@ -286,7 +286,7 @@ class PageOptions:
         return context
 
     def check(self) -> None:
-        """Checks that the server can listen at the address, and that the user accepts the risk.
+        """Raises UsageError if the server cannot listen on the address, or it is insecure.
 
         An address outside this machine must be encrypted, or declared as `insecure`.
 
@@ -313,9 +313,9 @@ class PageOptions:
 
 
 class PageServer:
-    """Serves the page of a session while a `with` statement runs.
+    """Serves the page of a session, as a context manager.
 
-    Entering the statement starts the server and opens a browser.
+    Entering the context starts the server and opens a browser.
 
     Args:
         bus: Network connection that reaches the session.
@@ -324,14 +324,14 @@ class PageServer:
         options: Address, encryption and further options of the server.
         ends: True if experimenters may end the session from their page.
         say: Function that prints a line for the user.
-        stage: The steps of an experiment with people. `None` if there is no experiment.
+        stage: The steps of an experiment with people, or `None` if there is no experiment.
 
     Attributes:
-        address: Link for an experimenter, with its token.
-        end_requested: Event that is set when a page has requested the end of the session.
-        files: Files that are sent over HTTP.
-        refused: Numbers of refused messages and requests, by reason.
-        view: Present state of the session.
+        address: Link for an experimenter, including the token.
+        end_requested: Set when a page has requested the end of the session.
+        files: Files served over HTTP.
+        refused: Mapping from reason to number of refused messages and requests.
+        view: Current state of the session.
     """
 
     def __init__(
@@ -417,10 +417,10 @@ class PageServer:
         self._opening.remove_file()
 
     def show(self, bus: Bus, session: str) -> None:
-        """Shows another session from now on.
+        """Switches to another session.
 
-        This method waits until the server's thread no longer uses the bus of the previous
-        session, so that the caller may close it.
+        Waits until the server thread no longer uses the bus of the previous session, so the
+        caller may close it.
 
         Args:
             bus: Network connection that reaches the session.
@@ -495,7 +495,7 @@ class PageServer:
             self._ready.set()
 
     def report_refusals(self) -> None:
-        """Prints the number of refused messages and requests of pages, one line per reason."""
+        """Prints the number of refused messages and requests, one line per reason."""
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
@@ -883,9 +883,9 @@ class PageServer:
 
     @property
     def experimenters(self) -> set[_Page]:
-        """The open web pages of experimenters.
+        """Open web pages of experimenters.
 
-        The pages that take part control the session.
+        Those that take part control the session.
         """
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
@@ -1160,10 +1160,9 @@ def _has_screen() -> bool:
 
 
 class PageAttendant(ExitStack):
-    """Serves the page of a session that this process runs, as for `trilat live`.
+    """Serves the page of a session run by this process, as for `trilat live`.
 
-    The page is served while a `with` statement runs. It stays open after the session, so that
-    it can show the report.
+    Used as a context manager. The page stays open after the session to show the report.
 
     Args:
         options: Address, encryption and further options of the server.
@@ -1180,10 +1179,10 @@ class PageAttendant(ExitStack):
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> Iterator[Callable[[], bool]]:
-        """Serves the web page of a session while the session runs, as a context manager.
+        """Context manager that serves the web page of a session while it runs.
 
-        The function that runs the session, such as `run_demo`, accepts this method as its
-        `SessionAttendant`, the function that watches the session and may end it.
+        This method can be passed as the `SessionAttendant` (the function that watches a session
+        and may end it) of functions such as `run_demo`.
 
         Args:
             session: Name of the session.
@@ -1200,13 +1199,13 @@ class PageAttendant(ExitStack):
         self._page.report_refusals()
 
     def offer_results(self, paths: Iterable[Path]) -> None:
-        """Offers files of the ended session to experimenters as long as their pages are open.
+        """Offers files of the ended session to experimenters while their pages are open.
 
-        Ctrl-C ends the offer. The address of a file cannot be guessed, and only these pages
-        receive it.
+        Stops on Ctrl-C. The address of a file cannot be guessed, and is sent only to these
+        pages.
 
         Args:
-            paths: The files, such as the report and the log.
+            paths: Paths of the files, such as the report and the log.
         """
         page = self._page
         clock = self._clock
@@ -1225,9 +1224,9 @@ class PageAttendant(ExitStack):
 def show_on_page(
     options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """Serves a web page that shows a session of other processes, as a context manager.
+    """Context manager that serves a web page for a session run by other processes.
 
-    The command `trilat watch --page` uses it as the argument `show` of `watch_session`.
+    Used by `trilat watch --page` as the argument `show` of `watch_session`.
 
     Args:
         options: Address, encryption and further options of the server.
@@ -1237,8 +1236,8 @@ def show_on_page(
         bus: Network connection that reaches the session.
 
     Yields:
-        The state of the session, and a function to update the display. This function does
-        nothing, because the server updates the page by itself.
+        The state of the session, and a function to update the display. The function does
+        nothing, since the server updates the page itself.
     """
     with PageServer(bus, clock, session, options, say=say) as page:
         yield page.view, lambda: None

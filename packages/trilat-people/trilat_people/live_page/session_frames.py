@@ -1,21 +1,19 @@
 """Composes the JSON messages from which the web pages of a running session are drawn.
 
-A session is a run in which several processes ("sites") each control one robot arm. A record
-contains the measurements and results of a site in one tick, a period of its control loop. A
-page first receives the constants of the session, such as the shapes of the arms. Then it
-receives about 30 frames a second. A frame is a message with the present state of each arm and
-network link, and with new points of the plots.
+A page first receives the constants of the session, such as the shapes of the arms, and then
+about 30 frames per second. A frame is a message with the current state of each arm and network
+link, and with new points for the plots.
 
 Invariant:
-    - A frame is computed from the records since the previous frame, but describes the whole
-      state. Therefore, a page may miss frames.
+    - A frame is computed from the records since the previous frame, but describes the complete
+      state, so a page may miss frames.
     - The plots show the extremes of the records between two frames, so that short peaks are
       visible.
     - Forces act on the arm and are in N. The forces of people and of the control law are
       computed from their torques: torque = J^T force, where J is the Jacobian of the end
-      effector. Near a singular pose, the force is the smallest one that explains the torque.
+      effector. Near a singular pose, the smallest force that explains the torque is used.
     - The frame for the user of one site shows every other arm as that user sees it: with the
-      delay of the network, and with the further delay of the picture if the scenario has one
+      delay of the network, and with the additional delay of the picture if the scenario has one
       (`SessionView.find_peer_ticks`). It contains no newer pose of these arms.
 """
 
@@ -27,19 +25,17 @@ import numpy as np
 
 from trilat_net.analysis import (
     AlignedRecords,
-    BodyTurns,
     TorqueSplit,
     VirtualWall,
     build_arm_rows,
-    joint_positions_m,
-    upright_axes,
 )
 from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
 from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, describe_event
+from trilat_net.scenario import Change, Scenario
 
+from .body_turns import BodyTurns
 from .session_view import SessionView, SiteView, Tail
 
 POINTS_KEPT = 1200
@@ -87,24 +83,22 @@ class _ArmFrames:
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
-        """Describes the constant properties of an arm, so that a web page can draw it.
+        """Describes the constant properties of an arm for the web pages that draw it.
 
         Returns:
-            Role, colour, joints, walls, limits and further constants of the arm, as plain
-            values for JSON.
+            Role, colour, joints, walls, limits and further constants of the arm, as
+            JSON-compatible values.
         """
         model = self._model
         settings = self._spec
         colours = self._scenario.assign_colours(COLOURS)
         site_number = self._scenario.names.index(self._site)
         colour = colours[site_number % len(colours)]
-        up = None
-        if model.chain is not None:
-            up_axes = upright_axes(model.chain)
-            up = _round(up_axes)
+        up_axes = self._rows.upright_axes
+        up = None if up_axes is None else _round(up_axes)
 
         q0 = np.array([settings.q0_rad], dtype=np.float64)
-        start_m = joint_positions_m(model, q0)[0]
+        start_m = self._rows.joint_positions_m(q0)[0]
         link_vectors_m = np.diff(start_m, axis=0)
         link_lengths_m = np.linalg.norm(link_vectors_m, axis=1)
         reach_m = float(link_lengths_m.sum())  # of the stretched arm
@@ -165,27 +159,27 @@ class _ArmFrames:
         }
 
     def describe_pose(self, q: Array) -> Json:
-        """Computes the points between the arm's links, for a web page that draws the arm.
+        """Computes the points between the links of the arm for the web pages that draw it.
 
         Args:
-            q: Positions of the joints, shape (n,), in rad or m.
+            q: Joint positions, in rad or m, shape (n,).
 
         Returns:
-            The points between the links of the arm in m, and the joint positions, as plain
-            values for JSON.
+            The points between the links in m and the joint positions, as JSON-compatible
+            values.
         """
         rows = q[np.newaxis]
-        points_m = joint_positions_m(self._model, rows)[0]
+        points_m = self._rows.joint_positions_m(rows)[0]
         return {
             "points": _round(points_m),
             "q": _round(q),
         }
 
     def describe_start(self) -> Json:
-        """Computes the points between the arm's links before the first control period.
+        """Computes the points between the links of the arm before the first control period.
 
         Returns:
-            The pose as `describe_pose` returns it, with the tick -1 and no bodies.
+            The pose in the format of `describe_pose`, with tick -1 and no bodies.
         """
         q0 = np.array(self._spec.q0_rad, dtype=np.float64)
         pose = self.describe_pose(q0)
@@ -196,16 +190,15 @@ class _ArmFrames:
         }
 
     def describe_now(self, records: AlignedRecords) -> tuple[Json, list[float]]:
-        """Describes the present state of the arm, and the peaks since the previous frame.
+        """Describes the current state of the arm and the peaks since the previous frame.
 
-        A frame is a message from which a page draws the session, about 30 times a second. The
-        largest values are plotted, so that peaks between two frames are visible.
+        The largest values are plotted, so that peaks between two frames are visible.
 
         Args:
-            records: Records since the previous frame. The last record describes the present.
+            records: Records since the previous frame, the last of which is the current one.
 
         Returns:
-            The present state as plain values for JSON, and four largest values: norm of the
+            The current state as JSON-compatible values, and four largest values: norm of the
             synchronisation error, torque of a joint in N m, force of people in N, and force of
             the walls in N.
         """
@@ -267,7 +260,7 @@ class _ArmFrames:
         else:
             last_row = len(records.known) - 1  # `known` has one entry per record
             last_reference = records.q_des[last_row:]  # shape (1, n), in rad or m
-            points_m = joint_positions_m(self._model, last_reference)[0]
+            points_m = self._rows.joint_positions_m(last_reference)[0]
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
@@ -358,18 +351,18 @@ class _ArmFrames:
 class SessionFrames:
     """Composes the messages from which web pages draw a running session.
 
-    About 30 times a second, a page receives a frame: a message with the present state of all
+    About 30 times per second, a page receives a frame: a message with the current state of all
     arms and network links.
 
     Args:
-        view: Present state of the session.
+        view: Current state of the session.
 
     Attributes:
-        points: Points of the plots over time. Each point is a list of values, and `describe`
-            states their names.
+        points: Points of the plots over time. Each point is a list of values, whose names are
+            given by `describe`.
         energies: Points of the energy plot: time in s, energy function V of the stability proof
-            in J, and energy that people and walls have supplied in J. V must not rise by more
-            than the supplied energy.
+            in J, and energy supplied by people and walls in J. V must not increase by more than
+            the supplied energy.
     """
 
     def __init__(self, view: SessionView) -> None:
@@ -388,12 +381,11 @@ class SessionFrames:
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
-        """Describes the constant facts about a session, for a web page that draws it.
+        """Describes the constants of a session for the web pages that draw it.
 
         Returns:
-            The sites, the links and the names of the plotted values, as plain values for JSON.
-            Before the session runs, the result contains the members that are present and those
-            that are missing.
+            The sites, the links and the names of the plotted values, as JSON-compatible values.
+            Before the session runs, the members that are present and those that are missing.
         """
         view = self._view
         scenario = view.scenario
@@ -438,8 +430,8 @@ class SessionFrames:
         """Returns events of the session, such as a lost connection, for the list on a page.
 
         Args:
-            first: Number of the first event.
-            most: Largest number of events.
+            first: Number of the first event to return.
+            most: Maximum number of events to return.
         """
         return [_render_event(event) for event in self._view.events.since(first, most)]
 
@@ -461,13 +453,13 @@ class SessionFrames:
         }
 
     def make_frame(self) -> Json | None:
-        """Composes the present state of all arms for web pages, as one message (frame).
+        """Composes the frame that shows the current state of all arms.
 
-        The frame covers all records since the previous frame. New points are also added to the
-        plots `points` and `energies`.
+        Covers all records since the previous frame. New points are also added to the plots
+        `points` and `energies`.
 
         Returns:
-            The present state of all arms and links, as plain values for JSON. `None` until
+            The current state of all arms and links as JSON-compatible values, or `None` until
             every site has published a record.
         """
         view = self._view
@@ -549,11 +541,8 @@ class SessionFrames:
     def describe_session_as_user(self) -> Json:
         """Describes the constants of the session for the page of a participant.
 
-        The settings of links and the dominance factors, the weights with which the arms follow
-        each other, are left out. They could reveal the condition of an experiment.
-
-        Returns:
-            The remaining constants of `describe`.
+        Same as `describe`, but excludes the settings of links and the dominance factors, which
+        could reveal the condition of an experiment.
         """
         constants = self.describe()
         if not constants["running"]:
@@ -570,13 +559,13 @@ class SessionFrames:
     def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
         """Derives the frame for the user of one arm from the frame that shows all arms.
 
-        A frame is a message from which a web page draws the session. The user sees the other
-        arms with their delay, in the poses that the site (process) of the user's arm last knew.
+        The user sees the other arms with their delay, in the poses last known to the user's
+        site.
 
         Args:
-            frame: Newest frame of `make_frame`. It is not changed.
+            frame: Newest frame returned by `make_frame`. Not modified.
             site: Name of the user's site.
-            ages: True to add the age of the pose of each other arm, in ms.
+            ages: True to include the age of the pose of each other arm, in ms.
 
         Returns:
             The frame for this user.
@@ -848,7 +837,7 @@ def _render_event(event: Event) -> Json:
         The parts of its line, as plain values for JSON.
     """
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
-    text = describe_event(event.kind, event.text, event.command)
+    text = Change.describe_event(event.kind, event.text, event.command)
     return {
         "t": t_s,
         "member": event.member,

@@ -1,21 +1,21 @@
-"""Keeps the state of a running session, which an observer reconstructs from its messages.
+"""State of a running session, as reconstructed by an observer from its messages.
 
-A session is a run in which several processes ("sites") each control one robot arm. Every site
-publishes a record per tick (period of its control loop), statistics of its network links, and
-events. An observer receives the same messages as the recorder. It sends nothing to the sites
-except requests for missing messages. Web pages and the command `trilat watch` show this state.
+Every site publishes one record per tick, statistics of its network links, and events. An
+observer receives the same messages as the recorder, and sends nothing to the sites except
+requests for missing messages. The state is shown on web pages and by the command `trilat
+watch`.
 
 Invariant:
     - The observer receives every record, and requests missing records from the buffers of the
-      sites, as the recorder does. Therefore the energy of the arms that it computes equals the
+      sites, as the recorder does. The energy of the arms that it computes therefore equals the
       energy computed from the log. Pages show only the newest record of each site.
-    - An observer that joins late does not request earlier records. It requests all events,
-      because they contain earlier changes of the session.
+    - An observer that joins late does not request earlier records. It does request all events,
+      since they contain earlier changes of the session.
     - A site has ended only if it has published an `end` event, never because it is silent. On a
-      busy machine a running site may be silent for long, and its records are used when they
-      arrive.
-    - A session has ended if every site has ended. Because a site that was killed sends no `end`
-      event, the session has also ended if the network reports that all sites have left, and
+      busy machine, a running site may be silent for a long time, and its records are used when
+      they arrive.
+    - A session has ended if every site has ended. A site that was killed sends no `end` event,
+      so the session has also ended if the network reports that all sites have left and
       `AWAY_NS` have passed.
 """
 
@@ -42,10 +42,10 @@ from trilat_net.net import (
 )
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import (
+    Change,
     LinkTables,
     PictureDelay,
     Scenario,
-    find_requester,
     parse_core_change,
     parse_embedded,
 )
@@ -61,16 +61,16 @@ T = TypeVar("T")
 
 
 class Tail(Generic[T]):
-    """The last entries of a growing list, such as the events of a session.
+    """The most recent entries of a growing list, such as the events of a session.
 
-    A reader, such as a page, remembers only how many entries it has read, and asks for the
-    entries that were added since.
+    A reader, such as a page, only remembers how many entries it has read, and asks for the
+    entries added since.
 
     Args:
-        most: Largest number of entries that are kept.
+        most: Maximum number of entries to keep.
 
     Attributes:
-        count: Number of entries that have been added, including those no longer kept.
+        count: Number of entries added so far, including those no longer kept.
     """
 
     def __init__(self, most: int) -> None:
@@ -78,10 +78,9 @@ class Tail(Generic[T]):
         self.count = 0
 
     def add(self, entry: T) -> None:
-        """Adds an entry to the end of a list of limited length.
+        """Appends an entry, dropping the oldest one if the list is full.
 
-        If the list is full, its oldest entry is dropped. A reader that was too slow then misses
-        this entry.
+        A reader that is too slow misses the dropped entry.
 
         Args:
             entry: The entry, for example a point of a plot.
@@ -90,16 +89,14 @@ class Tail(Generic[T]):
         self.count += 1
 
     def since(self, count: int, most: int) -> list[T]:
-        """Lists the entries that a reader does not know yet.
-
-        A page thus receives only the new events, and not all of them again.
+        """Returns the entries that a reader has not seen yet.
 
         Args:
             count: Number of entries that had been added when the reader last asked.
-            most: Largest number of entries to return. Older entries are left out.
+            most: Maximum number of entries to return. Older entries are skipped.
 
         Returns:
-            The entries, the oldest first. Empty if there are no new entries.
+            The new entries, oldest first.
         """
         kept_count = len(self._entries)
         unread_count = self.count - count
@@ -109,9 +106,7 @@ class Tail(Generic[T]):
 
 
 class SiteView:
-    """An observer's knowledge about one arm: its newest state, and which messages are missing.
-
-    The messages come from the process of the arm, its site.
+    """What an observer knows about one site: its newest state, and which messages are missing.
 
     Args:
         bus: Network connection that reaches the session.
@@ -119,27 +114,27 @@ class SiteView:
         scenario: Scenario of the session.
         name: Name of the site.
         boot: Random number that identifies this start of the site.
-        energy: Energy of the session, which has the latest records of the site.
+        energy: Energy of the session, which holds the latest records of the site.
 
     Attributes:
-        glides: True if the site stops smoothly when it loses its peers (the rule `glide`). Only
-            such a site has alarms.
-        peers: Names of the sites whose states the site receives.
+        glides: True if the site stops smoothly when it loses its peers (stale rule `glide`).
+            Only such a site has alarms.
+        peers: Names of the sites whose samples the site receives.
         layout: Numbers of joints and peers in its records, if the site continues without a lost
-            peer. Otherwise `None`.
-        hand: Settings for people who hold its arm. `None` if nobody can hold it.
-        reception: State of the reception of its messages, which shows the messages that have
-            arrived.
+            peer; otherwise `None`.
+        hand: Settings for people who hold its arm, or `None` if nobody can hold it.
+        reception: Tracks which of its messages have arrived.
         window: Its latest records.
-        holder: Person or program that took hold of its arm last.
-        stopped_by: Person or program that ordered its last stop, according to the site's
+        holder: Person or program that last took hold of its arm.
+        stopped_by: Person or program that requested its last stop, according to the site's
             events.
-        bodies: Poses of the bodies that its arm can touch, by tick, as far back as `window`.
-        dropped: Numbers of dropped messages by reason.
+        bodies: Mapping from tick to the poses of the bodies that its arm can touch, as far back
+            as `window`.
+        dropped: Mapping from reason to number of dropped messages.
         repair: Requests for its missing messages.
-        record: Its newest record. `None` before the first record.
-        stats: Its newest statistics. `None` before the first statistics.
-        first_tick: Tick of the first record if the observer has joined late, otherwise 0.
+        record: Its newest record, or `None` before the first one.
+        stats: Its newest statistics, or `None` before the first ones.
+        first_tick: Tick of the first record if the observer joined late; otherwise 0.
     """
 
     def __init__(
@@ -171,19 +166,19 @@ class SiteView:
         self.first_tick = 0
 
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
-        """Finds out whether the arm of the site needs attention, because of a stop or a fault.
+        """Returns an alarm if the arm of the site needs attention (a stop or a fault).
 
-        Only a site under the rule `glide` has alarms: by this rule an arm comes to rest while a
-        peer is silent. The alarm is derived from the newest record of the site: from its mode
-        and from `mem`, the values that it keeps from tick to tick.
+        Only a site with the stale rule `glide`, under which an arm comes to rest while a peer
+        is silent, has alarms. The alarm is derived from the newest record of the site: from its
+        mode and from `mem`, the values that it keeps from tick to tick.
 
         Args:
             session: Name of the session.
             name: Name of the site.
 
         Returns:
-            The alarm, with its reason. `None` if there is no alarm, if the site has ended, or
-            if its scenario has no alarms (`glides`).
+            The alarm with its reason. `None` if there is no alarm, if the site has ended, or if
+            it has no alarms (`glides`).
         """
         record = self.record
         if record is None or not self.glides or self.ended:
@@ -215,18 +210,14 @@ class SiteView:
 
     @property
     def ended(self) -> bool:
-        """True once the site has published its end, after which it sends no more records.
-
-        A site is the controller of one arm.
-        """
+        """True once the site has published its end, after which it sends no more records."""
         return self.reception.final_ticks is not None
 
     @property
     def complete(self) -> int:
-        """Control period (tick) up to which all records of the site have arrived or are lost.
+        """Last tick up to which every record of the site has either arrived or been lost.
 
-        A record is the result of one tick. No earlier record can still arrive. The value is -1
-        before the first record.
+        No earlier record can still arrive. -1 before the first record.
         """
         record_account = self.reception.accounts[topics.STATE]
         gap = record_account.find_requestable_gap()
@@ -237,10 +228,9 @@ class SiteView:
 
 
 class SessionView:
-    """An observer's knowledge about a running session, from the messages of its sites.
+    """What an observer knows about a running session from the messages of its sites.
 
-    A session is a run of several sites, processes that control one arm each. The owner calls
-    `poll` regularly, which receives the messages that have arrived.
+    The owner must call `poll` regularly to receive messages.
 
     Args:
         bus: Network connection that reaches the session.
@@ -248,15 +238,17 @@ class SessionView:
         session: Name of the session.
 
     Attributes:
-        scenario: Scenario of the session. `None` until a member has sent it.
-        sites: View of each running site, by name. Empty until all sites run.
+        scenario: Scenario of the session, or `None` until a member has sent it.
+        sites: Mapping from site name to the view of each running site. Empty until all sites
+            run.
         members: Identities of the members (sites and recorders) that have replied.
-        links: Present settings of every link between two sites, such as its delay, as tables.
-        dominance: For each site, the latest requested weights with which it follows its peers.
-        energy: The energy function V of the stability proof, computed while the session runs.
+        links: Current settings of every link, such as its delay, as tables.
+        dominance: Mapping from site name to the most recently requested dominance factors of
+            the site.
+        energy: Energy function V of the stability proof, computed while the session runs;
             `None` until all sites run.
-        events: The latest events of all members, oldest first.
-        dropped: Numbers of invalid or unknown messages, by the reason why they were dropped.
+        events: The most recent events of all members, oldest first.
+        dropped: Mapping from reason to number of dropped (invalid or unknown) messages.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
@@ -288,18 +280,18 @@ class SessionView:
 
     @property
     def running(self) -> bool:
-        """True once every site (arm controller) has replied that it runs.
+        """True once every site has replied that it is running.
 
-        Before that, `sites` is empty.
+        `sites` is empty until then.
         """
         return bool(self.sites)
 
     @property
     def ended(self) -> bool:
-        """True once there is nothing more to observe of the session.
+        """True once there is nothing more to observe.
 
-        This is the case if every site (arm controller) has published its end or has left the
-        network, or if `finish` was called. A session that has not begun has not ended.
+        This is the case if every site has published its end or has left the network, or if
+        `finish` was called. A session that has not started has not ended.
         """
         if not self.running:
             return False
@@ -309,11 +301,11 @@ class SessionView:
 
     @property
     def has_left(self) -> bool:
-        """True if every site has disappeared from the network for longer than `AWAY_NS`.
+        """True if every site has been gone from the network for longer than `AWAY_NS`.
 
-        The time is measured from the last sign of life of any site (arm controller): its last
-        message, or the notice that it has disappeared. A short loss of the connection therefore
-        does not end the observation.
+        The time is measured from the last sign of life of any site: its last message, or the
+        notification that it has disappeared. A short loss of the connection therefore does not
+        end the observation.
         """
         if self._left_ns is None:
             return False
@@ -322,23 +314,20 @@ class SessionView:
         return self._clock.monotonic_ns() - since_ns > AWAY_NS
 
     def finish(self) -> None:
-        """Marks the session as ended, even if the message about the end of a site was lost.
+        """Marks the session as ended, even if a message about the end of a site was lost.
 
-        The process that runs the session calls this when the processes of all sites have ended.
+        Called by the process that runs the session once the processes of all sites have ended.
         """
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
         """Returns the time since the last message of a running site arrived, in s.
 
-        A site is the controller of one arm. A silence shorter than `MIN_SILENCE_NS` counts as
-        0, because it is normal. A site that has ended is not silent.
+        A silence shorter than `MIN_SILENCE_NS` is normal and counts as 0. A site that has ended
+        is not silent.
 
         Args:
             site: The site.
-
-        Returns:
-            The duration, in s.
         """
         received_ns = site.reception.last_received_ns
         if received_ns is None or site.ended:
@@ -350,10 +339,10 @@ class SessionView:
 
     @property
     def session_silence_s(self) -> float:
-        """Time since the last message of any running site (arm controller), in s.
+        """Time since the last message of any running site, in s.
 
-        Displays show this time, because either the session or their own connection may be lost.
-        It is 0 while messages of any site arrive.
+        Shown by displays, since either the session or their own connection may be lost. 0 while
+        messages from any site arrive.
         """
         silences_s: list[float] = []
         for site in self.sites.values():
@@ -363,10 +352,10 @@ class SessionView:
         return min(silences_s, default=0.0)
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and requests missing messages.
+        """Receives the messages that have arrived, and requests missing ones.
 
-        The owner of this object calls it regularly, for example 30 times a second. It never
-        waits. Before the session runs, it only looks for the sites.
+        Must be called regularly, for example 30 times per second. Never blocks. Before the
+        session runs, it only looks for the sites.
         """
         now_ns = self._clock.monotonic_ns()
         self._note_presence(now_ns)
@@ -416,29 +405,24 @@ class SessionView:
 
     @property
     def complete_ticks(self) -> dict[str, int]:
-        """For every site, the last tick up to which all records have arrived or are lost.
-
-        A tick is a period of the control loop.
-        """
+        """Mapping from site to the last tick whose records have all arrived or been lost."""
         return {name: site.complete for name, site in self.sites.items()}
 
     def find_peer_ticks(
         self, site: str, tick: int, used: Mapping[str, int]
     ) -> Mapping[str, int]:
-        """Finds out at which tick the user of a site sees each of the other arms.
+        """Returns the ticks at which the user of a site sees the other arms.
 
-        A tick is a period of a control loop, and a sample is the state that a peer publishes in
-        a tick. The user sees a peer at the tick of the sample that the site uses for its
-        control law. If the scenario delays the user's picture further, it is the tick of an
-        earlier sample.
+        The user sees a peer at the tick of the sample that the site uses for its control law
+        or, if the scenario delays the picture further, at the tick of an earlier sample.
 
         Args:
             site: Name of the user's site.
             tick: Tick of the site's record.
-            used: For each peer of the site, the tick of the sample that it uses at `tick`.
+            used: Mapping from peer name to the tick of the sample that the site uses at `tick`.
 
         Returns:
-            The tick for each peer, by its name.
+            Mapping from peer name to tick.
         """
         assert self.scenario is not None
         if site not in self._pictures:
@@ -652,7 +636,7 @@ class SessionView:
                 site.holder = holder.removeprefix(f"{name}: ")
 
         if event.kind == "change":
-            site.stopped_by = find_requester(event.text) or site.stopped_by
+            site.stopped_by = Change.find_requester(event.text) or site.stopped_by
             if event.command:
                 self._apply_change(name, event.command)
 

@@ -1,8 +1,7 @@
 """Shows a running session until it ends, in a terminal or on a web page.
 
-A session is a run in which several processes ("sites") each control one robot arm.
-`watch_session` connects to the session and updates a display. The display is a table in the
-terminal (`trilat watch`), or a page (`trilat watch --page`). If standard input is a terminal, a
+`watch_session` connects to the session and updates a display, which is either a table in the
+terminal (`trilat watch`) or a page (`trilat watch --page`). If standard input is a terminal, a
 key stops every arm.
 """
 
@@ -20,7 +19,7 @@ from trilat_net.errors import SessionError
 from trilat_net.net import Bus, Clock, Connection, connect_to_session
 from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import embedded_names_reader
+from trilat_net.scenario import parse_embedded
 from trilat_net.signals import Interrupt
 
 from .page_orders import OrderDesk
@@ -50,28 +49,33 @@ def watch_session(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> int:
-    """Shows a running session, as an observer, until it ends or a signal arrives.
+    """Observes a running session and shows it until it ends or a signal arrives.
 
     Args:
         session: Name of the session.
-        connection: Network addresses and keys with which the session is reached.
+        connection: Network addresses and keys for connecting to the session.
         clock: Clock of this process.
         show: Function that shows the session, in a terminal or on a page.
         say: Function that prints a line for the user.
-        timeout_s: Longest time to wait for a reply of a site, in s.
+        timeout_s: Maximum time to wait for a reply from a site, in s.
 
     Returns:
-        The exit code of the command.
+        Exit code of the command.
 
     Raises:
         SessionError: There is no such session, or no site replies in time.
         UsageError: A network address cannot be used.
     """
     with Interrupt() as interrupt:
-        names = embedded_names_reader(session)
         stopped = interrupt.is_requested
         connection_to_session = connect_to_session(
-            connection, clock, session, names, stopped=stopped, timeout_s=timeout_s, say=say
+            connection,
+            clock,
+            session,
+            lambda text: parse_embedded(text, session).names,
+            stopped=stopped,
+            timeout_s=timeout_s,
+            say=say,
         )
 
         with connection_to_session as bus:
@@ -100,14 +104,14 @@ def watch_session(
 
 
 class SessionWatch:
-    """Composes the text with which `trilat watch` shows a running session in a terminal.
+    """Composes the text that `trilat watch` shows in a terminal.
 
     Args:
         bus: Network connection that reaches the session.
         clock: Clock of this process.
         session: Name of the session.
-        as_site: Site whose user's view is shown: the other arms with their delay. Empty to show
-            all sites without delay.
+        as_site: Site whose user's view is shown, with delayed poses of the other arms. Empty to
+            show all sites with no delay.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, as_site: str = "") -> None:
@@ -116,14 +120,15 @@ class SessionWatch:
         self._as_site = as_site
 
     def update(self) -> None:
-        """Receives the messages that have arrived, and checks the stability of the session.
+        """Receives new messages and checks the stability of the session.
 
-        The check uses V, the energy function of the stability proof. V must not rise by more
-        than people and walls supply. A text with the newest V, or with the reason why there is
-        no V, is stored for the line `title` above the table.
+        The energy function V of the stability proof must not increase by more than people and
+        walls supply. The newest V, or the reason why there is none, is kept for the line
+        `title` above the table.
 
         Raises:
-            ScenarioError: The session has no site whose user's view could be shown.
+            ScenarioError: The session does not contain the site whose user's view is to be
+                shown.
         """
         view = self.view
         view.poll()
@@ -148,12 +153,11 @@ class SessionWatch:
 
     @property
     def title(self) -> str:
-        """Line above the table, with the name of the session and its present state.
+        """Line above the table, with the name of the session and its current state.
 
-        The text states whether the session waits for members, has ended, or is silent, and for
-        how long. For a running session, the line also contains V, the energy with which
-        stability is checked. If only the view of one user is shown, the line names the user's
-        site instead of V.
+        States whether the session waits for members, has ended, or is silent, and for how long.
+        For a running session, the line also contains the energy V used to check stability, or,
+        if only one user's view is shown, the name of that user's site.
         """
         view = self.view
         silence_s = view.session_silence_s
@@ -170,10 +174,9 @@ class SessionWatch:
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
-        """Arm controllers (sites) that need attention: they hold, are stopped or have a fault.
+        """Sites that need attention because they are holding, stopped or faulty.
 
-        Each entry contains the name of the site and its alarm. The list is empty if there are
-        no alarms.
+        Each entry contains the name of the site and its alarm.
         """
         view = self.view
         alarms = []
@@ -186,16 +189,15 @@ class SessionWatch:
         return alarms
 
     def rows(self) -> list[StatusRow]:
-        """Composes the table of the sites (processes, one per arm), with one row per site.
+        """Composes the table of the sites, with one row per site.
 
-        If only the view of one user is shown, the user's own site has a complete row. The row
-        of another site contains the time and the joint angles of the pose that this user sees.
-        This pose is older than the newest pose, because the network delays it, and because the
-        scenario may delay the picture further.
+        If only one user's view is shown, the row of the user's own site is complete. The rows
+        of the other sites contain the time and the joint angles of the pose that this user
+        sees. This pose is delayed by the network, and possibly further by the scenario's
+        picture delay.
 
         Returns:
-            The rows. Each row is a dictionary of texts, by the headings of the columns. There
-            are no rows until the sites run.
+            The rows, each a mapping from column heading to string. Empty until the sites run.
         """
         view = self.view
         scenario = view.scenario
@@ -232,9 +234,9 @@ class SessionWatch:
 def show_in_terminal(
     clock: Clock, session: str, as_site: str, console: Console, bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """Shows a running session as a table in the terminal, as a context manager.
+    """Context manager that shows a running session as a table in the terminal.
 
-    The command `trilat watch` uses it as the argument `show` of `watch_session`.
+    Used by `trilat watch` as the argument `show` of `watch_session`.
 
     Args:
         clock: Clock of this process.
@@ -244,7 +246,7 @@ def show_in_terminal(
         bus: Network connection that reaches the session.
 
     Yields:
-        The state of the session, and a function that updates the display.
+        The state of the session and a function that updates the display.
     """
     watch = SessionWatch(bus, clock, session, as_site)
     desk = OrderDesk(bus, clock, session)
@@ -253,11 +255,11 @@ def show_in_terminal(
             display.say("S or space: stop every arm")
 
         def update_display() -> None:
-            """Updates the display. Stops every arm if the user has pressed S or space.
+            """Updates the display, and stops every arm if the user has pressed S or space.
 
-            `watch` composes the texts about the session, `desk` sends orders to the sites and
-            collects their replies, and `display` prints on the terminal. `read_keys` returns
-            the pressed keys, and is `None` if this process must not read the keyboard.
+            `watch` composes the text, `desk` sends requests to the sites and collects their
+            replies, and `display` prints to the terminal. `read_keys` returns the keys pressed,
+            and is `None` if this process must not read the keyboard.
             """
             watch.update()
             wants_stop = read_keys is not None and STOP_KEYS.intersection(read_keys())
@@ -302,7 +304,7 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
     def read() -> str:
         """Returns the keys that were pressed since the last call.
 
-        The text is empty if no keys were pressed, or if the terminal was closed.
+        Empty if no keys were pressed or the terminal was closed.
         """
         with suppress(OSError):
             readable, _, _ = select.select([keyboard], [], [], 0.0)

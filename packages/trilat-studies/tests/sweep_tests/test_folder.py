@@ -144,7 +144,10 @@ def entry(cell: int, seed: int = 1) -> CellRun:
 def opened(path: Path, sweep: str) -> RunJournal[CellRun]:
     """Opens the journal of a sweep."""
     return RunJournal(
-        path, sweep, CellRun, folders.build_resume_hint("sweep", "--resume", str(path.parent))
+        path,
+        sweep,
+        CellRun,
+        folders.RunJournal.build_resume_hint("sweep", "--resume", str(path.parent)),
     )
 
 

@@ -50,7 +50,7 @@ def judge_by_line(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leaves out the linear analysis, which takes seconds."""
-    monkeypatch.setattr(margin_search, "find_root_crossings", lambda *_, **__: ((), ""))
+    monkeypatch.setattr(margin_search.GrowthColumn, "find_crossings", lambda *_, **__: ((), ""))
 
 
 @pytest.mark.usefixtures("judge_by_line")

@@ -8,7 +8,7 @@ from study_builders import record_lane_times, use_lanes, use_single_runs
 from trilat_studies.measure_run import RunMetrics
 from trilat_studies.trials import Trial, run_trials, trials
 
-from trilat_net.scenario import Scenario, load_scenario, reseed_scenario
+from trilat_net.scenario import Scenario, load_scenario
 
 RANDOM = {
     "duration_s": 1.2,
@@ -23,7 +23,7 @@ def list_runs() -> list[Scenario]:
     """Returns five seeds of a run, one that diverges, one with two tick rates, one with a law
     in plain Python, and one with a metric of its log.
     """
-    runs = [reseed_scenario(load_scenario("free", RANDOM), seed) for seed in range(1, 6)]
+    runs = [load_scenario("free", RANDOM, seed=seed) for seed in range(1, 6)]
     changes: list[dict[str, Any]] = [
         {"limits.qd_limit_rad_s": 0.9},
         {"sites.s.rate_hz": 500},

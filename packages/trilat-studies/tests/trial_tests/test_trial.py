@@ -18,7 +18,7 @@ import trilat_net
 from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.override import apply_overrides
+from trilat_net.scenario.override import ScenarioOverrides
 
 CONSTANT = {"link": {"model": "constant", "delay_ms": 60.0}}
 
@@ -94,8 +94,9 @@ tables = st.dictionaries(
 def test_the_command_line_has_the_same_overrides(overrides: dict[str, Any]) -> None:
     by_text: dict[str, Any] = {}
     by_value: dict[str, Any] = {}
-    apply_overrides(by_text, shlex.split(shlex.join(list_assignments(overrides))))
-    apply_overrides(by_value, overrides)
+    texts = shlex.split(shlex.join(list_assignments(overrides)))
+    ScenarioOverrides.parse(texts).apply_to(by_text)
+    ScenarioOverrides.parse(overrides).apply_to(by_value)
     assert by_text == by_value
 
 

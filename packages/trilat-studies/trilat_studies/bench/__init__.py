@@ -1,8 +1,8 @@
-"""The benchmark suite: compares control laws in the same tasks, over the same network links.
+"""The benchmark suite, which compares control laws in the same tasks and over the same links.
 
-All laws run with the same random seeds, and one procedure tunes their gains, so that no law has
-an advantage. `plan_bench` selects the runs, `run_bench` executes them and stores them in a
-folder, and `BenchResults` composes tables of their results.
+To treat all laws alike, every law runs with the same random seeds, and its gains are tuned by
+the same procedure. `plan_bench` selects the runs, `run_bench` executes them and stores their
+results in a folder, and `BenchResults` turns the results into tables.
 """
 
 from .bench_plan import BenchPlan, plan_bench

@@ -1,15 +1,15 @@
-"""Draws the results of the benchmark as coloured tables: control laws against network links.
+"""Draws benchmark results as heat maps with one row per control law and one column per link.
 
-A figure has a panel per task. In a panel, a row is a control law, a column is a link with a
-certain delay and loss, and the colour of a field is the mean of a quantity, such as the error,
-over the runs of that law over that link. The figure "stable" shows the worst judgement of these
-runs instead.
+A figure has one panel per task. The colour of a cell is the mean of a quantity, such as the
+error, over all runs of that law over that link. In the figure "stable", the colour is the worst
+verdict of these runs.
 
 Invariant:
-    - The colour of a field depends only on its mean, or on its judgement.
-    - In a figure of means, a white cross marks a field with a run that is not stable. A white
-      dot marks a field without such a run, but with a run whose stability is open.
-    - Equal results give equal bytes.
+    - The colour of a cell depends only on its mean or on its verdict.
+    - In a figure of means, a white cross marks a cell in which at least one run is not stable.
+      A white dot marks a cell in which no run is unstable but the stability of at least one run
+      is open.
+    - Equal results give identical bytes.
 """
 
 from pathlib import Path
@@ -274,12 +274,12 @@ def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
-    """Writes the results of the benchmark of control laws as a page, tables and figures.
+    """Writes the benchmark results to a folder, as a Markdown page, tables and figures.
 
     Args:
         results: The results of the benchmark.
         folder: Folder in which the files are written.
-        command: The command that produces these files. The page shows it.
+        command: The command that produces these files, which is quoted on the page.
 
     Returns:
         The paths of the Markdown page, the CSV tables and the PNG figures.

@@ -1,19 +1,19 @@
 """Plans the benchmark of control laws: which law runs in which task, over which link.
 
-A task and a link (the delay and loss between the arms) are sets of overrides of a scenario that
-is shipped with the program, so `trilat sim` can reproduce every run. One law in one task over
-one link is called a cell. It runs once per random seed.
+Tasks and links (the delay and loss between the arms) are overrides of a scenario that ships
+with the program, so every run can be reproduced with `trilat sim`. A cell is one law in one
+task over one link, and runs once per random seed.
 
-The gains of all laws are tuned by one procedure, `trilat bench --tune`, which stores them in a
-file. Among the gains that stay stable even if all delays grow by the factor `TUNING_MARGIN`, it
-selects those with the smallest error.
+The gains of all laws are tuned by the same procedure, `trilat bench --tune`, which stores them
+in a file. It selects the gains with the smallest error among those that remain stable when all
+delays grow by the factor `TUNING_MARGIN`.
 
 Invariant:
-    - Gains are never set by hand. They come from `trilat bench --tune` only.
-    - Gains carry a fingerprint of the scenario for which they were tuned, and of the motion of
-      the arms under the law. If the fingerprint no longer matches, the user is told so.
-    - If no tried gains of a law stay stable with longer delays, the law gets no gains and does
-      not run.
+    - Gains are never set by hand, but always come from `trilat bench --tune`.
+    - Gains are stored with a fingerprint of the scenario in which they were tuned and of the
+      motion under the law. If the fingerprint no longer matches, the user is told.
+    - A law for which no tried gains remain stable with longer delays gets no gains and does not
+      run.
     - A selection that cannot run is rejected before the first run.
 """
 
@@ -318,17 +318,17 @@ ROUND_TRIPS = 40
 
 
 def build_settings(form: str, task: str, link: str, seed: int | None = None) -> dict[str, Any]:
-    """Returns the scenario overrides for a run of the benchmark, apart from the control law.
+    """Returns the scenario overrides for a benchmark run, excluding the control law.
 
-    The overrides turn one of the shipped scenarios into the requested task over the requested
-    link. They also set a duration of at least `ROUND_TRIPS` round trips of the link.
+    The overrides turn a shipped scenario into the requested task over the requested link, and
+    set a duration of at least `ROUND_TRIPS` round trips of the link.
 
     Args:
-        form: Kind of shipped scenario, a key of `BASES`. It determines the number of arms and
-            whether gravity acts on them.
+        form: Kind of shipped scenario, a key of `BASES`, which determines the number of arms
+            and whether gravity acts on them.
         task: Name of the task, a key of `TASKS`.
-        link: Name of the delay and loss between the arms, a key of `LINKS`.
-        seed: Seed of the run. If `None`, the seed of the scenario is kept.
+        link: Name of the network link, a key of `LINKS`.
+        seed: Random seed of the run. If `None`, the scenario's own seed is kept.
     """
     bench_task = TASKS[task]
     link_keys = dict(LINKS[link])
@@ -370,26 +370,25 @@ With an equally long run, a law whose arms come to rest slowly would appear to b
 
 
 class TunedGains(msgspec.Struct, frozen=True):
-    """Gains of a control law, tuned for one kind of scenario and one round trip of the network.
+    """Gains of a control law, tuned for one kind of scenario and one network round trip.
 
-    The procedure tries `tried` candidates. Some candidates come to rest at the pose of the
-    task, even when delays grow by `TUNING_MARGIN`. Among these, the procedure selects the
-    candidate with the smallest error.
+    The tuning tries `tried` candidates. Of those that come to rest at the pose of the task even
+    when delays grow by `TUNING_MARGIN`, it selects the one with the smallest error.
 
     Attributes:
         form: Kind of scenario in which the law runs, a key of `BASES`.
         law: Name of the control law.
-        round_trip_ms: The round trip, in ms.
+        round_trip_ms: Round trip for which the gains were tuned, in ms.
         gains: The selected gains by name. Empty if no candidate stayed stable with longer
             delays.
         settled: Number of candidates that came to rest at the pose.
         tried: Number of all candidates.
-        passed: Number of candidates that came to rest with a smaller error than the selected
-            candidate, but do not stay stable with longer delays.
+        passed: Number of candidates that had a smaller error than the selected one but were
+            rejected because they do not stay stable with longer delays.
         error_rad: Error of the selected candidate, in rad. `None` if no candidate was selected.
         effort_nm: Effort of the selected candidate, in N m. `None` if no candidate was
             selected.
-        fingerprint: Fingerprint of the scenario and of the law, see `fingerprint_tuning`.
+        fingerprint: Fingerprint of the scenario and the law, see `fingerprint_tuning`.
     """
 
     form: str
@@ -405,18 +404,14 @@ class TunedGains(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Identifier of these control gains in the file of all tuned gains.
-
-        It consists of the kind of scenario (`form`), the name of the control law, and the round
-        trip of the links in ms.
-        """
+        """Identifies these gains in the gains file: scenario kind, law and round trip in ms."""
         return self.form, self.law, self.round_trip_ms
 
     @property
     def is_stale(self) -> bool:
         """True if the law or the scenario has changed since these gains were tuned.
 
-        The law then has to be tuned again, see `fingerprint_tuning`.
+        A law with stale gains must be tuned again, see `fingerprint_tuning`.
         """
         return fingerprint_tuning(*self.key) != self.fingerprint
 
@@ -425,22 +420,20 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Converts changed settings of a scenario to texts KEY=VALUE for the command line.
+    """Converts scenario overrides to KEY=VALUE strings for the command line.
 
     Args:
-        settings: Values by key of the scenario.
+        settings: Mapping from scenario key to value.
     """
     return [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
 
 
 def load_tuning_task(form: str, law: str, round_trip_ms: int) -> TuningScenario:
-    """Loads the scenario in which the gains of a control law are tuned for the benchmark.
-
-    The law is tuned for one round trip of the network.
+    """Loads the scenario in which the benchmark tunes a law for a given network round trip.
 
     Args:
         form: Kind of scenario, a key of `BASES`, such as "two" for two arms.
-        law: Name of the control law. The scenario does not contain it yet.
+        law: Name of the control law. The returned scenario does not contain it yet.
         round_trip_ms: Round trip of the links between the arms, in ms.
     """
     task = _OTHER_TUNING_TASKS.get((form, law), TUNING_TASK)
@@ -480,16 +473,16 @@ def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
 
 @cache
 def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
-    """Returns a digest of everything on which tuned gains depend.
+    """Returns a digest of everything that determines the tuned gains of a law.
 
-    These are the scenario, the motion under the law, the ranges in which its gains are
-    searched, and the procedure. If stored gains have another fingerprint, they were tuned for
-    another experiment or another version of the law.
+    The digest covers the scenario, the motion under the law, the ranges in which the gains are
+    searched, and the tuning procedure. A different fingerprint on stored gains means that they
+    were tuned for another experiment or another version of the law.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
         law: Name of the control law.
-        round_trip_ms: Round trip of the tuning, in ms.
+        round_trip_ms: Round trip for which the law is tuned, in ms.
     """
     space = SEARCH_SPACES[law]
     task = load_tuning_task(form, law, round_trip_ms)
@@ -500,13 +493,14 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
 
 
 def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
-    """Reads the control gains from the file of tuned gains of the benchmark.
+    """Reads the tuned gains of the benchmark from their file.
 
     Args:
-        path: The file.
+        path: Path of the gains file.
 
     Returns:
-        The gains by form, law and round trip in ms. Empty if there is no file.
+        The gains, keyed by scenario kind, law and round trip in ms. Empty if the file does not
+        exist.
     """
     if not path.exists():
         return {}
@@ -515,11 +509,10 @@ def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains
 
 
 def choose_round_trip(mean_ms: float) -> int:
-    """Returns the tuned round trip, in ms, whose gains a link with a given round trip uses.
+    """Selects the tuned round trip, in ms, whose gains a link should use.
 
-    It is the shortest tuned round trip that is not shorter than the round trip of the link. If
-    the link's round trip is longer than all tuned round trips, the longest tuned round trip is
-    returned.
+    This is the shortest tuned round trip that is at least as long as the mean round trip of the
+    link, or the longest tuned one if all are shorter.
 
     Args:
         mean_ms: Mean round trip of the link, in ms.
@@ -563,23 +556,22 @@ def tune_laws(
     known: Iterable[TunedGains] = (),
     store: Callable[[TunedGains], None] = lambda _: None,
 ) -> list[TunedGains]:
-    """Tunes control laws for the benchmark, at each of several round trips of the links.
+    """Tunes control laws for the benchmark, once for each round trip in `TUNED_ROUND_TRIPS_MS`.
 
-    The round trips are `TUNED_ROUND_TRIPS_MS`. Gains that are known and up to date are not
-    tuned again, so an interrupted tuning continues.
+    Known gains that are up to date are not tuned again, so an interrupted tuning can be
+    continued.
 
     Args:
-        laws_by_form: Names of the laws to tune, by the kind of scenario in which they run, such
-            as "two" for two arms. The keys are keys of `BASES`.
+        laws_by_form: Mapping from kind of scenario (a key of `BASES`, such as "two" for two
+            arms) to the names of the laws to tune in it.
         jobs: Number of processes, as for `trilat_net.tune`.
-        on: Cluster that tries the gains, as for `trilat_net.tune`.
-        progress: Function that is called with the number of finished tunings and of all
-            tunings.
-        budget: Number of choices of gains to try, per gain of a law. A law with three gains
-            gets three times this number.
-        known: Gains that were tuned before. Gains that are out of date are ignored.
-        store: Function that is called with the gains of each law at each round trip as soon as
-            they are tuned. It is not called for known gains.
+        on: Cluster that evaluates the gains, as for `trilat_net.tune`.
+        progress: Called with the number of completed tunings and the total number of tunings.
+        budget: Number of gain vectors to try per gain of a law. A law with three gains gets
+            three times this number.
+        known: Gains from earlier tunings. Stale gains are ignored.
+        store: Called with the gains of a law at one round trip as soon as they are tuned. Not
+            called for known gains.
 
     Returns:
         The gains of every law at every round trip.
@@ -665,12 +657,12 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
 
 
 def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
-    """Writes tuned control gains into a file, and keeps the other gains in the file.
+    """Merges newly tuned gains into the gains file.
 
     Args:
-        tuned: The gains to write. They replace gains in the file that were tuned for the same
-            kind of scenario, the same control law and the same round trip.
-        path: The file, in JSON.
+        tuned: The gains to write. They replace gains in the file that have the same kind of
+            scenario, control law and round trip. All others are kept.
+        path: Path of the JSON file.
     """
     entries = read_gains(path)
     for gains in tuned:
@@ -684,10 +676,7 @@ MAX_BENCH_SEEDS = 1000
 
 
 class BenchCell(NamedTuple):
-    """A cell of the suite: a control law in a task over a link, with its gains and seeds.
-
-    The suite compares control laws in several tasks and over links with different delays and
-    losses.
+    """One cell of the benchmark: a control law in one task over one link, with gains and seeds.
 
     Attributes:
         task: A key of `TASKS`.
@@ -695,7 +684,7 @@ class BenchCell(NamedTuple):
         link: A key of `LINKS`.
         form: Kind of scenario in which the law runs, a key of `BASES`.
         tuned: Gains of the law for this link.
-        seeds: Seeds of the runs, one run each.
+        seeds: Random seeds, one run each.
     """
 
     task: str
@@ -707,14 +696,14 @@ class BenchCell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the law, task and network link in results, as in "contact/wave/rtt272"."""
+        """Name of this cell in results: task, law and link, as in "contact/wave/rtt272"."""
         return f"{self.task}/{self.law}/{self.link}"
 
     @property
     def inputs(self) -> str:
         """Hash of everything that determines these simulations: scenario, task, link and gains.
 
-        Stored results with a different hash are out of date and are not used.
+        Stored results with a different hash are out of date and are ignored.
         """
         parts = (
             _load_base_text(self.form),
@@ -726,18 +715,17 @@ class BenchCell(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name under which the journal of finished runs stores this law, task and link.
+        """Name of this cell in the journal of finished runs.
 
-        The name contains the hash `inputs` of the scenario and the gains. Therefore runs with
-        other gains are not mistaken for these runs.
+        It contains the hash `inputs`, so runs with other gains cannot be mistaken for these.
         """
         return f"{self.name} {self.inputs}"
 
     def build(self, seed: int) -> TuningScenario:
-        """Returns the scenario of one simulation: a control law with its tuned gains in a task.
+        """Returns the scenario of one run of this cell, with the tuned gains.
 
         Args:
-            seed: Seed of the run.
+            seed: Random seed of the run.
         """
         settings = build_settings(self.form, self.task, self.link, seed)
         base = TuningScenario.load(BASES[self.form], format_settings(settings))
@@ -746,14 +734,13 @@ class BenchCell(NamedTuple):
 
 
 class BenchPlan(NamedTuple):
-    """All simulations of the benchmark of control laws, or of a part, ready to be executed.
+    """All simulations of the benchmark, or of part of it, ready to be executed.
 
     Attributes:
         study: Name of the study, which is a selection of tasks, laws and links.
-        cells: The combinations of a task, a control law and a link that are run, in running
-            order.
+        cells: The combinations of task, control law and link to run, in order of execution.
         laws: Pairs of a selected law and the kind of scenario in which it runs (a key of
-            `BASES`). A law without any run still has a row in the tables, without numbers.
+            `BASES`). A law without any run still has a row in the tables, with no values.
         without: Tunings of selected laws that found no stable gains. These laws do not run over
             the links that would use those tunings.
     """
@@ -765,31 +752,27 @@ class BenchPlan(NamedTuple):
 
     @property
     def tasks(self) -> list[str]:
-        """Names of the tasks that run in the benchmark, each once, in running order.
-
-        A study may select only some of the tasks of the suite.
-        """
+        """Names of the tasks to run, each listed once, in order of execution."""
         return list(dict.fromkeys(cell.task for cell in self.cells))
 
     @property
     def links(self) -> list[str]:
-        """Names of the benchmark's simulated network links, in the order of its figures."""
+        """Names of the network links to simulate, in the order used in the figures."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
     def runs(self) -> int:
-        """Number of simulations of the benchmark: one per random seed and combination.
+        """Number of simulations: one per cell and random seed.
 
-        A combination is a control law in a task over a network link. Repetitions that confirm a
-        result are not counted.
+        Repetitions that confirm a result are not counted.
         """
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
-        """Returns one combination of law, task and link, by its name "contact/wave/rtt272".
+        """Looks up a cell by its name.
 
         Args:
-            name: Name of the cell, as in "contact/wave/rtt272": task, law and link.
+            name: Task, law and link, as in "contact/wave/rtt272".
 
         Raises:
             UsageError: No cell has that name.
@@ -822,15 +805,15 @@ def plan_bench(
     links: Sequence[str] = (),
     seeds: int | None = None,
 ) -> BenchPlan:
-    """Plans one of the studies of the benchmark of control laws, or a part of it.
+    """Plans one of the benchmark's studies, or part of it.
 
     Args:
         study: A key of `STUDIES`.
-        tasks: Names of the selected tasks. If empty, all tasks of the study are selected.
-        laws: Names of the selected laws. If empty, all laws of the study are selected.
-        links: Names of the selected links, which may be any keys of `LINKS`. If empty, all
-            links of the study are selected.
-        seeds: Number of seeds. If `None`, the number of the study is used.
+        tasks: Names of the tasks to run. If empty, all tasks of the study.
+        laws: Names of the laws to run. If empty, all laws of the study.
+        links: Names of the links to run over, which may be any keys of `LINKS`. If empty, all
+            links of the study.
+        seeds: Number of random seeds. If `None`, the study's own number is used.
 
     Returns:
         The checked plan, ready to run.
@@ -896,21 +879,21 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Returns a table entry that explains why the benchmark does not simulate a law in a task.
+    """Returns the table entry that explains why a law is not simulated in a task.
 
     Args:
         law: Name of the control law.
-        form: Kind of scenario in which the law runs, a key of `BASES`. For example, the form
-            "three" has two users and a slave arm, and the form "two" has a single user.
+        form: Kind of scenario in which the law runs, a key of `BASES`. For example, "three" has
+            two users and a slave arm, and "two" has a single user.
         task: Name of the task, a key of `TASKS`.
 
     Returns:
-        - "-" if the task needs two users, and the form has a single user.
-        - "no handover" if one user hands over the control to the other in this task, and the
-          law cannot change the users' shares.
-        - "exact model" if the gravity parameters are wrong in this task, and the law takes the
+        - "-" if the task needs two users and the scenario has only one.
+        - "no handover" if one user hands over control to the other in this task and the law
+          cannot change the users' shares.
+        - "exact model" if the gravity parameters are wrong in this task and the law uses the
           exact model of the arm instead.
-        - `NO_GAINS` otherwise. In this case, the tuning of the law found no stable gains.
+        - `NO_GAINS` otherwise, which means that the tuning found no stable gains for the law.
     """
     bench_task = TASKS[task]
     if bench_task.users > 1 and form != "three":

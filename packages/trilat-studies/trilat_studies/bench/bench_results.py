@@ -1,16 +1,15 @@
-"""Summarises the results of the benchmark as tables, Markdown, CSV and JSON.
+"""Summarises benchmark results as tables, in Markdown, CSV and JSON.
 
-The benchmark runs control laws in several tasks, over network links with different delays and
-losses, with several random seeds. For each law, the tables show over how many links the law is
-stable, which properties its runs have, and the means of the measured quantities. One law in one
-task over one link is called a cell.
+For each law, the tables show over how many links it is stable, which properties its runs have,
+and the means of the measured quantities. A cell is one law in one task over one link, and has
+one run per random seed.
 
 Invariant:
     - The output depends only on the runs. It contains no time of day, so equal results give
-      equal bytes.
+      identical bytes.
     - A mean or share over at least `LEAST_SEEDS` seeds has its 95 % confidence interval.
     - Every run that is not stable is visible in the tables.
-    - Laws are not ranked, because which quantity matters depends on the use.
+    - Laws are not ranked, because it depends on the application which quantity matters.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,62 +44,59 @@ LEAST_SEEDS = 20
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns the name under which a journal stores the finished simulations of one law.
-
-    The simulations belong to one control law in one task over one network link.
+    """Returns the name under which the journal stores the finished runs of a cell.
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
-        to_s: Duration in s of runs that are repeated over a longer time, which becomes part of
+        to_s: Duration of runs that are repeated over a longer time, in s, which becomes part of
             the name. 0 for the first runs.
     """
     return f"{key} to {to_s:g} s" if to_s else key
 
 
 class BenchRun(msgspec.Struct, frozen=True):
-    """A finished run of the suite, with its judgement and its measured numbers.
+    """A finished benchmark run, with its verdict and its measured quantities.
 
-    A worker process creates it, and the journal of the suite stores it. The attribute
-    `error_rad` and all later attributes are `None` if the run diverged.
+    Worker processes create these objects, and the journal of the suite stores them. For a run
+    that diverged, `error_rad` and all later attributes are `None`.
 
     Attributes:
         name: Name of the cell, as in "contact/wave/rtt272".
         inputs: Digest of everything that determines the runs of the cell.
-        seed: Seed of the run.
-        random: True if another seed would give another run.
+        seed: Random seed of the run.
+        random: True if the run would differ with another seed.
         sha256: Digest of the scenario of the run.
-        stability: Judgement of the run by its end and by its twins, which are repeated runs
+        stability: Verdict from the end of the run and from its twins, which are repeated runs
             with a small disturbance (docs/reference/stability.md).
         behaviour: How the run ended, for example at rest or diverged.
-        text: Explanation of the judgement.
+        text: Explanation of the verdict.
         length_s: Duration of the judged run, in s.
         to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
             for a first run.
-        at_limit: True if the run would have needed more ticks (control periods) than the safety
-            limit allows.
-        confirmed: True if the repeated run was not stable either. False if the repeated run was
-            stable, which refuted the first run. `None` if there is no repeated run, because the
+        at_limit: True if the run would have needed more ticks than the safety limit allows.
+        confirmed: True if the repeated run was not stable either, False if the repeated run was
+            stable and so refuted the first one. `None` if there was no repetition, because the
             first run diverged or was not judged "not stable".
-        bounded: True if no joint exceeded the velocity `BOUND_RAD_S`, or moved more than
+        bounded: True if no joint exceeded the velocity `BOUND_RAD_S` or moved more than
             `THROWN_RAD` away from its start.
         energy_j: Minimum over time of the total energy that operators, friction and wall had
             put into the arms, in J.
         settled_s: Time from which all arms stay at their final poses, in s. `None` if there is
             no such time within the run.
         error_rad: RMS over time and joints of the difference between the slave and the average
-            of the users, weighted with the dominance factors and without delay, in rad.
+            of the users (weighted with the dominance factors, with no delay), in rad.
         effort_nm: RMS of tau - G(q), the torque without gravity, over sites and joints, in N m.
         hand_nm: RMS torque of the operators over the joints of the arms that have an operator,
             in N m.
         wall_n: Mean force of the wall in the last quarter of the task, in N. `None` if there is
             no wall.
         force_peak_n: Largest force of the wall, in N. `None` if there is no wall.
-        stiffness_n_m: Stiffness that the user feels 2 s after contact, in N/m, from two runs
-            with different reaches. `None` unless both runs have such a contact.
+        stiffness_n_m: Stiffness that the user feels 2 s after contact, in N/m, computed from
+            two runs with different reaches. `None` unless both runs have such a contact.
         impedance_n_s_m: |Z| at 1 Hz that the user feels in contact, minus |Z| in free motion,
             in N s/m. `None` if there was no contact.
-        free_impedance_n_s_m: |Z| at 1 Hz that the user feels in free motion, in N s/m. It is
-            measured in the task `contact` only.
+        free_impedance_n_s_m: |Z| at 1 Hz that the user feels in free motion, in N s/m. Measured
+            in the task `contact` only.
     """
 
     name: str
@@ -129,20 +125,19 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def cell(self) -> str:
-        """Name that identifies this run, with its seed, in the journal of finished runs.
+        """Name that identifies the runs of this cell in the journal of finished runs.
 
-        The name consists of the task, the law, the link, and a digest of the scenario and the
-        gains. If this run repeats a first run over a longer time, the name also contains the
-        duration.
+        It consists of the task, the law, the link, and a digest of the scenario and the gains.
+        For a repetition over a longer time, it also contains the duration.
         """
         return name_run(f"{self.name} {self.inputs}", self.to_s)
 
     @property
     def needs_confirmation(self) -> bool:
-        """True if this run was judged not stable, but a longer run might be stable.
+        """True if this run was judged not stable, but might be stable over a longer time.
 
-        False if the run diverged, which means that the motion grew without bound: a longer run
-        would end at the same time. Also false if this run is itself a repetition.
+        False for a run that diverged, since a longer run would end at the same time, and for a
+        run that is itself a repetition.
         """
         diverged = self.behaviour is EndBehaviour.DIVERGED
         is_first = not self.to_s
@@ -150,19 +145,19 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def confirmation_s(self) -> float:
-        """Duration of the repetition of this run if the run was judged not stable, in s.
+        """Duration of the longer repetition of this run if it was judged not stable, in s.
 
-        The repetition is longer than the run. If it is not stable either, it confirms the
-        judgement; if it is stable, it refutes it.
+        The repetition confirms the verdict if it is not stable either, and refutes the verdict
+        otherwise.
         """
         return CONFIRMATION_LENGTHS * self.length_s
 
     @property
     def masked(self) -> bool:
-        """True if the slave should touch a wall but did not.
+        """True if the slave should touch a wall in this run but did not.
 
-        The numbers of such a run are those of free motion. They are not shown, because they
-        would look better than those of a run with contact.
+        Quantities of such a run describe free motion and would look better than those of a run
+        with contact, so they are not shown.
         """
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
 
@@ -198,7 +193,7 @@ _JUDGEMENTS = (
 
 
 class BenchCellResult(NamedTuple):
-    """Results of one control law in one task over one network link, a run for each random seed.
+    """Results of one control law in one task over one network link, with one run per seed.
 
     Attributes:
         cell: The law, task, link and gains of the runs.
@@ -210,27 +205,23 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of simulations that were judged stable.
-
-        Runs in which the arms only came to rest do not count.
-        """
+        """Number of runs that were judged stable, excluding runs that were only settled."""
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Counts the simulations with a given judgement, for example "not stable".
+        """Counts the runs with a given verdict.
 
         Args:
-            stability: The judgement to count, for example `Stability.NOT_STABLE`.
+            stability: The verdict to count, for example `Stability.NOT_STABLE`.
         """
         return sum(run.stability is stability for run in self.runs)
 
     @property
     def judgement(self) -> Stability:
-        """Whether the control law is stable in all runs of this task over this link.
+        """The worst verdict of the runs in this cell.
 
-        The value is the worst judgement of the runs: not stable if a run is not stable,
-        otherwise open if a run could not be decided, otherwise settled if a run only came to
-        rest, otherwise stable.
+        From worst to best: not stable, open (could not be decided), settled (only came to
+        rest), stable.
         """
         worst_first = (Stability.NOT_STABLE, Stability.OPEN, Stability.SETTLED)
         occurring = [stability for stability in worst_first if self.count(stability)]
@@ -238,9 +229,9 @@ class BenchCellResult(NamedTuple):
 
     @property
     def masked(self) -> bool:
-        """True if the slave arm should touch a wall, but did not touch it in at least one run.
+        """True if the slave arm should touch a wall but did not in at least one of the runs.
 
-        The numbers of these runs are not shown, because they do not describe the task.
+        Quantities of such a cell are not shown, because they do not describe the task.
         """
         return any(run.masked for run in self.runs)
 
@@ -248,9 +239,8 @@ class BenchCellResult(NamedTuple):
     def is_passive(self) -> bool:
         """True if the control law never generated energy in these runs.
 
-        This means that at no time had the arms returned more energy to their surroundings,
-        including the operators, than they had received. False if a run diverged, which means
-        that the motion grew without bound.
+        In that case, the arms never returned more energy to their surroundings (including the
+        operators) than they had received. False if a run diverged.
         """
         return self.energy_j is not None and self.energy_j >= PASSIVE_J
 
@@ -258,22 +248,20 @@ class BenchCellResult(NamedTuple):
     def energy_j(self) -> float | None:
         """Lowest net energy that the environment had put into the arms at any time, in J.
 
-        The environment is the operators, the friction and the wall. The value is the minimum
-        over time and over all runs of this law in this task over this link. A negative value
-        means that the arms gave back more energy than they had received, so the control law
-        generated energy.
-
-        The value is `None` if a run diverged.
+        The environment consists of the operators, the friction and the wall. The minimum is
+        taken over time and over all runs of this cell. A negative value means that the control
+        law generated energy: the arms had returned more than they had received. `None` if a run
+        diverged.
         """
         values = [run.energy_j for run in self.runs if run.energy_j is not None]
         return min(values) if len(values) == len(self.runs) else None
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % confidence interval of the share of stable runs, by Wilson's method.
+        """95 % confidence interval of the share of stable runs, computed with Wilson's method.
 
-        The interval is `None` for fewer than `LEAST_SEEDS` runs, because it would be too wide
-        to be useful.
+        `None` for fewer than `LEAST_SEEDS` runs, because the interval would be too wide to be
+        useful.
         """
         if len(self.runs) < LEAST_SEEDS:
             return None
@@ -286,9 +274,9 @@ class BenchCellResult(NamedTuple):
             quantity: Name of the quantity, a key of `QUANTITIES`.
 
         Returns:
-            The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval.
-            `None` if a run lacks the quantity, or if the slave was supposed to touch a wall
-            and did not in at least one run.
+            The mean, with its 95 % confidence interval if there are at least `LEAST_SEEDS`
+            runs. `None` if a run lacks the quantity, or if the slave should touch a wall but
+            did not in at least one run.
         """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:
@@ -299,17 +287,14 @@ class BenchCellResult(NamedTuple):
 
 
 class BenchResults(Result):
-    """Results of the benchmark, or of a part of it, for texts, files and searches.
-
-    The benchmark simulates control laws in several tasks over several network links. `places`
-    has one result per combination of law, task and link.
+    """Results of the benchmark, or of part of it, for printing, export and search.
 
     Attributes:
         plan: Plan of the suite.
         places: The results of all cells, in the order of the plan.
         runs: All runs, in the same order.
-        alone: Reasons why runs were not computed side by side with others, with the number of
-            these runs. Runs of a benchmark that computes all runs one by one are not counted.
+        alone: Maps each reason why runs were not computed side by side with others to the
+            number of these runs. Not used in a benchmark that computes all runs one at a time.
     """
 
     def __init__(
@@ -327,12 +312,12 @@ class BenchResults(Result):
         self.runs = [run for result in self.places for run in result.runs]
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that describes the results of the benchmark.
+        """Yields the sections of the benchmark report.
 
-        The parts are a description of the study, and a table that counts the stable runs of
-        each control law. Then each task has a table of the properties of its runs, and a table
-        for each measured quantity, such as the error. In the study "round-trips", a last table
-        has the effects of delay and loss.
+        The report describes the study and counts the stable runs of each control law. It
+        continues with one table of run properties per task, and one table per task and measured
+        quantity, such as the error. In the study "round-trips", the last table shows the
+        effects of delay and loss.
         """
         yield from _describe_bench(self)
         yield from filter(None, [describe_runs_alone(self.alone, len(self.runs))])
@@ -349,18 +334,13 @@ class BenchResults(Result):
             yield _tabulate_round_trips(self)
 
     def headline(self) -> str:
-        """Returns one sentence with the name of the benchmark and its number of simulations.
-
-        It also counts the combinations (cells) of control law, task and network link.
-        """
+        """Returns one sentence with the benchmark's name and its number of runs and cells."""
         cells = count_nouns(len(self.places), "cell")
         runs = count_nouns(len(self.runs), "run")
         return f"{self.plan.study}: {cells}, {runs}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results of the benchmark to plain values, for JSON.
-
-        `trilat bench --json` prints them.
+        """Converts the results to plain values that `trilat bench --json` prints.
 
         Returns:
             The study, the gains that its cells use, and the rows of all cells ("places").
@@ -372,19 +352,16 @@ class BenchResults(Result):
         return {"study": self.plan.study, "gains": entries, "places": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the results as a table of plain values, one row per cell of the suite.
-
-        A cell is a law in a task over a link. The rows are those of the CSV file.
-        """
+        """Returns the results as the rows of the CSV file, one per cell."""
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
-        """Yields the results of one task, for all or one of the control laws and links.
+        """Yields the results of one task, optionally limited to one control law or one link.
 
         Args:
             task: Name of the task, such as "contact".
-            law: Name of the control law to select. If empty, all laws are selected.
-            link: Name of the link to select. If empty, all links are selected.
+            law: Name of the control law. If empty, all laws are selected.
+            link: Name of the link. If empty, all links are selected.
         """
         for result in self.places:
             cell = result.cell
@@ -392,7 +369,7 @@ class BenchResults(Result):
                 yield result
 
     def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
-        """Returns the result of one control law in one task over one network link.
+        """Looks up the result of one control law in one task over one network link.
 
         Args:
             task: Name of the task.
@@ -400,12 +377,12 @@ class BenchResults(Result):
             link: Name of the link.
 
         Returns:
-            The result. `None` if the plan does not contain the cell.
+            The result, or `None` if the plan does not contain the cell.
         """
         return next(self.select(task, law, link), None)
 
     def encode_runs(self) -> str:
-        """Encodes all simulations of a benchmark as a CSV table, one line per simulation."""
+        """Encodes the runs of the benchmark as CSV text, with one row per run."""
         cells = {cell.name: cell for cell in self.plan.cells}
         rows = [
             _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in self.runs
@@ -416,9 +393,9 @@ class BenchResults(Result):
         """Composes the Markdown page that reports the results of the benchmark.
 
         Args:
-            command: The command that writes the page, which is shown at its top.
-            pictures: Subject of each picture, by the name of its file in the folder of the
-                page.
+            command: The command that writes the page, quoted at the top.
+            pictures: Maps the file name of each picture in the page's folder to the subject of
+                the picture.
         """
         parts = [
             f"# The suite: {self.plan.study}",
@@ -518,7 +495,7 @@ def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
 def name_law(law: str, form: str) -> str:
     """Returns the name of a control law for tables, as in "wave (two sites)".
 
-    The note in parentheses shows that only two arms take part.
+    The note in parentheses is added if only two arms take part.
 
     Args:
         law: Name of the control law.

@@ -1,23 +1,23 @@
-"""Executes the runs of the benchmark suite, decides whether each is stable, and measures it.
+"""Executes benchmark runs, judges their stability and measures their performance.
 
-`run_bench` is called with a plan of runs and a folder, in which finished runs are stored.
-Stability is judged in the same way as by `trilat certify`: from the end of the run and from the
-characteristic roots of its control loop. If these do not suffice, the run is repeated with a
-small push, which shows whether disturbances grow.
+`run_bench` takes a plan and a folder that stores finished runs. Stability is judged as in
+`trilat certify`: from the end of the run and from the characteristic roots of its control loop.
+If that is inconclusive, the run is repeated with a small push, to see whether disturbances
+grow.
 
-Some runs are too short for a decision. They are repeated with a duration of `TIME_CONSTANTS` of
-their slowest time constants. A run that is not stable is repeated over twice its length.
-Errors, efforts and forces are measured over the time of the task only, from the same records
-that `trilat sim` writes.
+Runs that are too short for a verdict are repeated with a duration of `TIME_CONSTANTS` of their
+slowest time constants. A run that is not stable is repeated over twice its length. Errors,
+efforts and forces are computed over the time of the task only, from the same records that
+`trilat sim` writes.
 
 Invariant:
     - The results of a run depend only on its scenario. The number of processes, their order and
       interruptions have no influence.
-    - A run that is in the journal of the folder is not executed again. A run with other gains
-      counts as another run, and so does the repetition of a run over twice its length.
-    - The duration of a run has no limit except `MAX_RUN_TICKS`. If this limit ends a run, the
-      explanation of its judgement says so.
-    - A folder contains only runs of one version of the program with one kind of arithmetic, see
+    - A run in the folder's journal is not executed again. A run with other gains counts as a
+      different run, and so does the repetition of a run over twice its length.
+    - The duration of a run has no limit except `MAX_RUN_TICKS`. If a run reaches this limit,
+      the explanation of its verdict says so.
+    - All runs in a folder come from the same program version and floating-point arithmetic, see
       `describe_program`.
 """
 
@@ -34,7 +34,7 @@ import numpy as np
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
     THROWN_RAD,
-    DominancePlan,
+    DominanceHistory,
     EndBehaviour,
     RunEnd,
     Stability,
@@ -44,19 +44,18 @@ from trilat_net.analysis import (
     decision_facts,
     judge_virtual_run,
 )
-from trilat_net.core import Array
+from trilat_net.core import Array, TorqueKind
 from trilat_net.errors import CodeFailed, UsageError
 from trilat_net.files import make_results_folder, refuse_link, write_whole
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, ViscousEnvironment
+from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
     StudyFolder,
+    WorkerPool,
     Workers,
-    build_resume_hint,
     ignore_progress,
-    open_worker_pool,
 )
 
 from ..measure_run import RecordBatch, WholeRun, describe_program
@@ -112,15 +111,15 @@ It is half of the least force of the wall that counts as contact, so the slave k
 
 
 class BenchRunItem(NamedTuple):
-    """Everything that a worker process needs to execute one run of the benchmark.
+    """Everything that a worker process needs to execute one benchmark run.
 
     The object is pickled and sent to the process.
 
     Attributes:
         cell: The task, control law and link of the run, with the tuned gains.
-        seed: Seed of the run.
-        to_s: Duration in s, if the run repeats a first run over twice its length to check that
-            it is not stable. 0 for a first run.
+        seed: Random seed of the run.
+        to_s: Duration of the repetition, in s, if the run repeats a first run over twice its
+            length to check that it is not stable. 0 for a first run.
         is_side_by_side: True to compute the run together with others, if possible.
     """
 
@@ -133,36 +132,34 @@ class BenchRunItem(NamedTuple):
         return f"{self.cell.name}, seed {self.seed}"
 
     def run(self) -> BenchRun:
-        """Simulates a run of the benchmark, judges its stability, and measures its performance.
+        """Simulates one benchmark run, judges its stability and measures its performance.
 
-        The method depends only on this object, so any worker process can call it.
+        The result depends only on this object, so any worker process can compute it.
 
         Returns:
-            The finished run, ready for the journal. It has the judgement of its stability and
-            measured numbers such as error and effort. A run that diverged has no such numbers.
+            The finished run, ready for the journal. A run that diverged has a verdict, but no
+            measured quantities such as error and effort.
         """
         scenario = _build_scenario(self)
         return _measure_item(self, scenario, WholeRun.simulate(scenario))
 
 
 class JudgedRun(NamedTuple):
-    """A run of the benchmark with all of its records, and the decision whether it is stable.
+    """A benchmark run with all of its records and the verdict on its stability.
 
-    If the characteristic roots do not decide, twins do: repetitions of the run with a small
-    push, which show whether disturbances grow.
+    If the characteristic roots are inconclusive, the verdict is based on twins: repetitions
+    with a small push, which show whether disturbances grow.
 
     Attributes:
-        scenario: Scenario of the run. Its duration is that of the run.
+        scenario: Scenario of the run, with the duration that was simulated.
         records: All records of the run, by site.
         end: Analysis of the end of the run.
-        twins: Growth of the small disturbances of the twins. `None` if the roots decide without
-            them.
+        twins: Growth of the disturbances in the twins. `None` if the roots were conclusive.
         roots: Characteristic roots of the loop at the end of the run.
-        stability: The judgement.
-        text: Explanation of the judgement.
-        at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks (control
-            periods).
-        rests_on: Evidence for the judgement, as in the stability certificate.
+        stability: The verdict.
+        text: Explanation of the verdict.
+        at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks.
+        rests_on: Evidence for the verdict, as in the stability certificate.
     """
 
     scenario: Scenario
@@ -182,7 +179,7 @@ class JudgedRun(NamedTuple):
 
     @classmethod
     def simulate(cls, scenario: Scenario, length_s: float) -> "JudgedRun":
-        """Simulates a scenario, and judges the run's stability as `trilat certify` would.
+        """Simulates a scenario and judges its stability as `trilat certify` would.
 
         Args:
             scenario: The scenario. Its own duration is ignored.
@@ -192,13 +189,13 @@ class JudgedRun(NamedTuple):
         return _judge_records(scenario, WholeRun.simulate(scenario))
 
     def lengthen(self) -> "JudgedRun":
-        """Repeats a run over a longer time if its judgement needs more time.
+        """Repeats the run over a longer time if it was too short for a reliable verdict.
 
-        A run that is stable or settled, and whose arms are at rest at its end, is long enough.
-        Any other run must last for `TIME_CONSTANTS` of its slowest time constants.
+        A run is long enough if it is stable or settled and its arms are at rest at the end. Any
+        other run must last for `TIME_CONSTANTS` of its slowest time constants.
 
         Returns:
-            The longer run, or the same run if it is long enough.
+            The longer run, or this run if it is long enough.
         """
         if self.diverged:
             return self
@@ -452,30 +449,30 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
         The torque in N m, shape (records, joints).
     """
     operator_torque: Array = -record.tau_x
-    for source in scenario.sites[name].environment:
-        if isinstance(source, ViscousEnvironment):
-            damping = np.array(source.damping_nm_s_rad)
-            operator_torque = operator_torque + damping * record.qd
+    for part in scenario.sites[name].environment:
+        source = part.actor
+        if source.kind is TorqueKind.VISCOUS:
+            operator_torque = operator_torque + np.array(source.B) * record.qd
     return operator_torque
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:
-    """Computes the minimum over time of the net energy that the arms received from outside.
+    """Computes the minimum over time of the net energy that the arms received, in J.
 
-    The net energy that the arms received until time t is the integral of -sum_i tau_x_i' qd_i
-    from the start to t, computed with the trapezoidal rule. Here -tau_x_i is the torque from
-    outside on arm i, in N m, which the records contain with the opposite sign. qd_i is the
-    joint velocity of the arm, in rad/s.
+    The net energy up to time t is the integral of -sum_i tau_x_i' qd_i from the start to t,
+    computed with the trapezoidal rule. Here -tau_x_i is the external torque on arm i, in N m
+    (the records contain it with the opposite sign), and qd_i is the joint velocity of the arm,
+    in rad/s.
 
     All arms start at rest. If network and controllers are passive, the arms cannot return more
-    energy than they received, so the net energy never falls below 0, apart from numerical
+    energy than they received, so the net energy never falls below 0 except for numerical
     errors. A negative result shows that energy was generated.
 
     Args:
         records: All records of the run, by the name of the arm.
 
     Returns:
-        The minimum, in J. It is at most 0, because the net energy is 0 at the start.
+        The minimum, in J. At most 0, because the net energy is 0 at the start.
     """
     arm_powers = []
     for record in records.values():
@@ -803,7 +800,7 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     """
     slave = records[SLAVE]
     t_s = slave.t_ns / NS_PER_S
-    alpha = DominancePlan.of_scenario(scenario, SLAVE).evaluate(t_s).alpha
+    alpha = DominanceHistory.of_scenario(scenario, SLAVE, t_s).alpha
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
         weight = alpha[:, index, None]
@@ -820,16 +817,16 @@ BenchFolder = StudyFolder[BenchPlan, BenchRun]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
-    """Creates the folder of a benchmark, or opens one in which some runs are finished.
+    """Creates the folder of a benchmark, or reopens one that already has finished runs.
 
     Args:
         plan: Plan of the benchmark.
         path: The folder. If `None`, it is named after the study, as in runs/bench-full.
 
     Raises:
-        UsageError: The folder cannot be created or has other content. The same error is raised
-            if its runs come from another version of the program, or from a machine with
-            different rounding, because such results must not be mixed.
+        UsageError: The folder cannot be created, has other content, or has runs that must not
+            be mixed with new ones because they come from another program version or a machine
+            with different rounding.
     """
     if path is None:
         path = Path("runs") / f"bench-{plan.study}"
@@ -846,7 +843,7 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
         make_results_folder(path, "", force=None)
         write_whole(origin_file, origin)
 
-    remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(path))
+    remedy = RunJournal.build_resume_hint("bench", "--study", plan.study, "--out", str(path))
     journal_file = path / JOURNAL_NAME
     return StudyFolder(
         path=path,
@@ -888,15 +885,15 @@ def run_bench(
     *,
     confirm: bool = False,  # noqa: ARG001
 ) -> BenchResults:
-    """Executes those simulations of a benchmark that are not finished yet.
+    """Executes all benchmark runs that are not finished yet.
 
     Args:
         folder: Folder of the benchmark. Its journal contains the finished runs.
         jobs: Number of processes, as for `trilat_net.bench`.
         on: Cluster that executes the runs, as for `trilat_net.bench`.
-        progress: Function that is called with the number of finished runs and of all runs.
-        confirm: Has no effect, and is accepted for older programs. Every run that is not stable
-            is repeated over twice its duration, because a longer run may show that it is
+        progress: Called with the number of finished runs and the total number of runs.
+        confirm: Has no effect; accepted for compatibility with older programs. Every run that
+            is not stable is repeated over twice its duration, because it may turn out to be
             stable.
 
     Returns:
@@ -986,7 +983,7 @@ def _run_pending(
         return
     in_lanes = any(item.is_side_by_side for item in pending)
     hint = "; finished runs are kept: the same command continues"
-    with open_worker_pool(jobs, on, most=len(pending), hint=hint) as pool:
+    with WorkerPool.open(jobs, on, most=len(pending), hint=hint) as pool:
         journal.run_pending(
             pool,
             BenchRunItem.run,

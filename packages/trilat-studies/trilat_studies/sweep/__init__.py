@@ -1,4 +1,4 @@
-"""Computes stability maps: for which parameters of a scenario the arms are stable.
+"""Computes stability maps, which show for which scenario parameters the arms are stable.
 
 A sweep runs a scenario over a grid of its keys, in virtual time and on all cores.
 docs/studies/sweep.md describes the commands.

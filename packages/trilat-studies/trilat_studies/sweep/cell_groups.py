@@ -1,14 +1,13 @@
 """Orders the runs of a sweep so that many of them can be simulated side by side.
 
-A sweep runs a scenario with many combinations of parameters, called cells. Runs that differ
-only in numbers, such as a gain or a delay, are computed together with vector instructions. A
-parameter may also change the structure of the scenario: the control law, the joints of an arm,
-the sites or their tick rates. This module divides the cells into groups with the same
-structure. The groups run one after the other.
+Cells that differ only in numerical parameters, such as a gain or a delay, are computed together
+with vector instructions. Other parameters change the structure of the scenario: the control
+law, the joints of an arm, the sites or their tick rates. This module divides the cells of a
+sweep into groups with the same structure, which are run one after the other.
 
 Invariant:
     - Every cell of the grid belongs to exactly one group.
-    - Groups change the order of the runs, but not the results.
+    - Grouping changes the order of the runs, but not the results.
 """
 
 from collections.abc import Hashable, Iterator, Sequence
@@ -27,15 +26,15 @@ LAW_KEY = "law"
 
 
 class CellGroups(NamedTuple):
-    """Divides the grid of a sweep into groups of runs that can be simulated side by side.
+    """Divides the grid of a sweep into groups of cells that can be simulated side by side.
 
-    The runs of a group have the same structure: control laws, joints, sites and tick rates. For
-    example, a sweep over two control laws and 50 delays has two groups of 50 cells.
+    All cells in a group have the same structure: control laws, joints, sites and tick rates.
+    For example, a sweep over two control laws and 50 delays has two groups of 50 cells.
 
     Attributes:
         keys: Keys of the axes that change the structure.
-        parts: For each dimension of the grid, its indices as parts of equal structure. The law
-            is the first dimension.
+        parts: For each dimension of the grid, its indices, partitioned by structure. The law is
+            the first dimension.
     """
 
     keys: tuple[str, ...]
@@ -45,12 +44,12 @@ class CellGroups(NamedTuple):
     def of_plan(cls, plan: SweepPlan) -> "CellGroups":
         """Groups the cells of a sweep by the structure of their scenarios.
 
-        Scenarios along each axis are compared, with the other axes at their first values. Up to
-        32 values of an axis are checked, since a grid may be large. If they differ and the axis
-        has more values, each of its values is a group of its own.
+        Each axis is examined with all other axes at their first values. To limit the cost for
+        large grids, at most 32 values per axis are loaded. If their structures differ and the
+        axis has further values, every value of that axis becomes a group of its own.
 
         Args:
-            plan: The sweep: its scenario, axes, control laws and seeds.
+            plan: The sweep.
         """
         names = (LAW_KEY, *(axis.key for axis in plan.axes))
         keys = []
@@ -76,15 +75,12 @@ class CellGroups(NamedTuple):
 
     @property
     def group_count(self) -> int:
-        """Number of groups into which the simulations of a parameter sweep are divided.
-
-        It is the product of the numbers of parts into which the axes are divided.
-        """
+        """Number of groups into which the cells of the sweep are divided."""
         return prod(map(len, self.parts))
 
     @property
     def sentence(self) -> str:
-        """Sentence that tells the user along which parameters a sweep is divided into groups.
+        """Sentence that tells the user by which parameters the sweep is divided into groups.
 
         Empty if there is only one group.
         """
@@ -98,9 +94,7 @@ class CellGroups(NamedTuple):
         )
 
     def iterate_cells(self, shape: Sequence[int]) -> Iterator[int]:
-        """Yields the numbers of all cells (grid points) in the order of their runs.
-
-        The cells of a group follow each other.
+        """Yields the numbers of all cells in order of execution, one group after the other.
 
         Args:
             shape: Number of values in each dimension of the grid.

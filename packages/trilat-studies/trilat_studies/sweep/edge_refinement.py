@@ -1,15 +1,14 @@
 """Chooses the runs of a sweep that locate the edge between stable and unstable parameters.
 
-A map of 201 by 201 parameter values needs 40 401 runs, most of which lie far from the edge. A
-refined sweep runs a coarse part of this grid. Then it halves the boxes that the edge crosses,
-again and again, until their corners are neighbours in the grid. A cell is one point of the
-grid.
+A map of 201 by 201 parameter values has 40 401 cells, most of which lie far from the edge. A
+refined sweep first runs a coarse subset of this grid. It then repeatedly halves the boxes that
+the edge crosses, until their corners are neighbouring cells.
 
 Invariant:
-    - The chosen cells depend only on the plan and on the results, not on the order of the runs
-      or on interruptions.
+    - The choice of cells depends only on the plan and on the results, not on the order of the
+      runs or on interruptions.
     - A box is halved if two of its known points lie on different sides of the edge. An edge
-      that enters and leaves a coarse box between two of its corners is not seen.
+      that enters and leaves a coarse box between two of its corners is missed.
     - A cell is chosen at most once.
 """
 
@@ -31,11 +30,10 @@ UNSTABLE, STABLE, UNDECIDED = range(3)
 
 
 class EdgeRefinement:
-    """Chooses which parameter combinations of a sweep are simulated, near edges of stability.
+    """Chooses which cells of a sweep are simulated, refining the grid near edges of stability.
 
-    It begins with a coarse grid and makes it finer in rounds. The caller simulates the
-    combinations (cells) that `find_next_cells` returns, and passes their results to its next
-    call, until no cells are returned.
+    The refinement proceeds in rounds. In each round, the caller simulates the cells returned by
+    `find_next_cells` and passes the results to the next call, until no more cells are returned.
 
     Args:
         plan: The sweep, whose `refine` is the number of halvings.
@@ -51,9 +49,7 @@ class EdgeRefinement:
         self._chosen = np.zeros(plan.cells, bool)
 
     def find_next_cells(self, sides: Mapping[int, int]) -> list[int]:
-        """Stores the results of the last simulations, and returns the cells to simulate next.
-
-        These cells are combinations of the swept parameters near an edge of stability.
+        """Stores the results of the last round and returns the cells to simulate next.
 
         Args:
             sides: Side of each cell that has run since the last call.
@@ -76,10 +72,7 @@ class EdgeRefinement:
         return []
 
     def list_coarse_cells(self) -> list[int]:
-        """Returns the numbers of the parameter combinations with which a refined sweep begins.
-
-        They form a coarse grid, which is refined where neighbouring results differ.
-        """
+        """Returns the numbers of the cells in the coarse grid, which are simulated first."""
         is_needed = np.zeros(self._shape, bool)
         for panel in self._iterate_panels():
             is_needed[panel] = self._mark_lattice()
@@ -87,10 +80,10 @@ class EdgeRefinement:
         return numbers
 
     def count_most_cells(self) -> int:
-        """Estimates how many parameter combinations will be simulated in a refined sweep.
+        """Estimates the number of cells that a refined sweep will simulate.
 
-        It is assumed that the edge of stability crosses each panel of the map once. The
-        estimate is used to tell the user how long the sweep will take.
+        The estimate assumes that the edge of stability crosses each panel of the map once. It
+        is used to tell the user how long the sweep will take.
         """
         panels = sum(1 for _ in self._iterate_panels())
         along_edge = 0
@@ -102,13 +95,14 @@ class EdgeRefinement:
 
     @staticmethod
     def choose_side(*, stable: int, decided: int) -> int:
-        """Returns whether a cell is stable, unstable or undecided, by the majority of its runs.
-
-        The result is one of the constants `STABLE`, `UNSTABLE` and `UNDECIDED`.
+        """Classifies a cell as stable, unstable or undecided by a majority of its runs.
 
         Args:
             stable: Number of stable runs of the cell.
             decided: Number of runs that are stable or not stable.
+
+        Returns:
+            One of the constants `STABLE`, `UNSTABLE` and `UNDECIDED`.
         """
         if 2 * stable == decided:
             return UNDECIDED  # without a decided run, or without a majority

@@ -1,20 +1,20 @@
 """Draws a stability map and writes its page: map.png, map.svg, map.pdf and map.md.
 
-A stability map shows for which parameters a scenario is stable. The figure has a coloured cell
-for each combination of two parameters. Limits of stability from theory are drawn as lines. The
-colour of a cell depends on the runs of the sweep:
+A stability map shows for which parameters a scenario is stable. The figure has one coloured
+cell per combination of two parameters, and theoretical stability limits are drawn as lines. The
+colour of a cell depends on the sweep:
 
 - With one run per cell, the colour shows how the run ended, for example converged or diverged.
-- With several random seeds per cell, it shows the fraction of runs that are stable. Undecided
-  runs are left out.
-- If growth exponents were measured, which are the rates at which small disturbances grow, it
-  shows the exponent. White means zero.
+- With several random seeds per cell, it shows the fraction of runs that are stable, excluding
+  undecided runs.
+- If growth exponents (the rates at which small disturbances grow) were measured, it shows the
+  exponent. White means zero.
 
-Vector files contain the cells as an image, because viewers show seams between adjacent shapes.
-The colours differ in lightness, for grey print and colour-blind readers.
+Vector files embed the cells as an image, because viewers show seams between adjacent shapes.
+The colours differ in lightness, for greyscale printing and colour-blind readers.
 
 Invariant:
-    - The page contains only results, lines and commands. Equal results give equal bytes.
+    - The page contains only results, lines and commands. Equal results give identical bytes.
     - The colour of a cell depends on its own results alone.
     - A cell is hatched if half or more of its runs are undecided, or if its exponent is
       missing.
@@ -124,23 +124,22 @@ _COLOUR_BAR_IN = 0.6
 
 
 class MapReport:
-    """Figure and page of a stability map, which shows where a scenario is stable.
+    """Figure and page of a stability map.
 
     Args:
-        chart: The results of the runs, the lines from theory, and the texts of the map.
+        chart: The results of the runs, the theoretical lines, and the texts of the map.
     """
 
     def __init__(self, chart: StabilityMap) -> None:
         self._chart = chart
 
     def draw(self, form: FigureSize) -> Figure:
-        """Draws a stability map, which shows with which parameters a scenario is stable.
+        """Draws the stability map as a grid of coloured cells.
 
-        The map is a coloured grid. A sweep with more than two parameters has several panels,
-        each with the same two axes.
+        A sweep with more than two parameters has several panels with the same two axes.
 
         Args:
-            form: Width, type sizes and resolution of the figure.
+            form: Width, font sizes and resolution of the figure.
         """
         plane = self._chart.plane
         lines = self._chart.lines
@@ -202,20 +201,18 @@ class MapReport:
         return figure
 
     def write(self, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
-        """Writes the figure and the Markdown page of a stability map into an existing folder.
-
-        A stability map shows with which parameters a scenario is stable.
+        """Writes the figure and the Markdown page of the stability map into an existing folder.
 
         Args:
             folder: The folder.
             width_in: Width of the figure, in inches.
 
         Returns:
-            The paths of the three picture files and of the page.
+            The paths of the three image files and of the page.
 
         Raises:
-            UsageError: A figure in print cannot have this width. It must be as wide as one or
-                two columns of a page.
+            UsageError: The width is neither that of one column nor that of two columns of a
+                printed page.
         """
         form = FigureSize.for_print(width_in)
         figure = self.draw(form)
@@ -229,16 +226,13 @@ class MapReport:
         return [*picture_paths, page_path]
 
     def build_page(self, picture: str) -> str:
-        """Composes the Markdown page of a stability map.
+        """Composes the Markdown page of the stability map.
 
-        The page has the commands that create the map, the picture, the number of runs of each
-        class, notes, and for each panel a table of the measured edges of stability.
+        The page contains the commands that create the map, the figure, the number of runs in
+        each class, notes, and one table of measured stability edges per panel.
 
         Args:
-            picture: File name of the picture.
-
-        Returns:
-            The text of the page.
+            picture: File name of the figure.
         """
         chart = self._chart
         commands = "\n".join(chart.commands)

@@ -1,10 +1,9 @@
 """Finds stability margins: the values of a scenario key at which stability begins or ends.
 
-A sweep runs one scenario on a grid of parameters. At each grid point, this module finds the
-edges of stability along one further key, such as "control.d". It runs the scenario at evenly
-spaced values of the key (the scan), and narrows each interval in which stability changes by
-bisection. The edges are reported next to the edges that theory predicts, as a table, a Markdown
-page and plain values.
+At each grid point of a sweep, this module finds the edges of stability along one further key,
+such as "control.d". It first runs the scenario at evenly spaced values of the key (the scan),
+and then uses bisection to narrow each interval in which stability changes. The edges are
+reported next to those predicted by theory, as a table, a Markdown page and plain values.
 
 Invariant:
     - An edge lies between two values that were run, one of them stable and the other not.
@@ -22,14 +21,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.analysis import find_root_crossings
+from trilat_net.analysis import GrowthColumn
 from trilat_net.errors import ScenarioError, UsageError, count_nouns
 from trilat_net.files import write_whole
-from trilat_net.own_code import list_imported_code
 from trilat_net.presentation import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 
 from ..run_commands import format_override_value
 from . import sweep_cell
@@ -54,13 +52,13 @@ False if it is not stable, and `None` if it is undecided.
 
 
 class KeyMargin(NamedTuple):
-    """Limits of stability along one scenario key, found by running selected values of the key.
+    """Stability edges along one scenario key, found by running selected values of the key.
 
     At an edge, neighbouring values change from stable to not stable or back.
 
     Attributes:
-        spans: The edges in rising order. There may be several, for example if stability is lost
-            at one value and regained at a larger value.
+        spans: The edges in ascending order. There may be several, for example if stability is
+            lost at one value and regained at a larger value.
         stable: If there are no edges, True if all decided values are stable, and False if no
             value is stable. `None` if there are edges, or if no value was decided.
         undecided: Number of values at which the stability of the run remained undecided.
@@ -82,31 +80,29 @@ class KeyMargin(NamedTuple):
         *,
         whole: bool = False,
     ) -> "KeyMargin":
-        """Finds the limits of stability between two values of a scenario key.
+        """Finds the stability edges between two values of a scenario key.
 
-        The function runs a number of evenly spaced values, and then narrows each interval in
-        which stability changes by bisection.
+        Runs the scenario at evenly spaced values, and then uses bisection to narrow each
+        interval in which stability changes.
 
         Args:
-            stable: Function that runs the scenario at a value of the key. It returns True if
-                the run is stable, False if it is not stable, and `None` if it is undecided.
+            stable: Runs the scenario at a value of the key. Returns True if the run is stable,
+                False if it is not, and `None` if it is undecided.
             low: Lower end of the range.
             high: Upper end of the range.
-            tolerance: Width of an interval, as a fraction of the value, at which the bisection
-                stops.
-            whole: True if the key accepts only whole numbers.
+            tolerance: Interval width, as a fraction of the value, at which the bisection stops.
+            whole: True if the key accepts only integers.
 
         Returns:
-            The intervals that contain the limits. If there are none, the result states whether
+            The intervals that contain the edges. If there are none, the result states whether
             all values are stable.
         """
         results: dict[float, bool | None] = {}
 
         def classify(value: float) -> bool | None:
-            """Returns whether the scenario is stable at a value of the searched parameter.
+            """Returns whether the run at a value is stable, or `None` if it is undecided.
 
-            If scan and bisection reach the same value, it is simulated only once. The result is
-            `None` if the run is undecided.
+            A value that both the scan and the bisection reach is simulated only once.
             """
             if value not in results:
                 results[value] = stable(value)
@@ -192,10 +188,10 @@ def _bisect(
 
 
 class SearchRange(NamedTuple):
-    """A setting along which the limits of stability are searched, and the searched range.
+    """A scenario key and the range in which its stability edges are searched for.
 
     Attributes:
-        key: Scenario key along which edges are searched.
+        key: Scenario key along which edges are searched for.
         low: Lower end of the range.
         high: Upper end of the range.
         tolerance: Largest width of an edge, as a fraction of its value.
@@ -207,13 +203,9 @@ class SearchRange(NamedTuple):
     tolerance: float
 
     def format_axis(self) -> str:
-        """Returns the text of a sweep axis with two values: the ends of the searched range.
+        """Returns a sweep axis with both ends of the range as values, such as "control.d=1,20".
 
-        If a sweep is planned with this axis, the scenario is checked at both ends before any
-        run.
-
-        Returns:
-            The text, as in "control.d=1,20".
+        Planning a sweep with this axis checks the scenario at both ends before any run.
         """
         low = format_override_value(self.low)
         high = format_override_value(self.high)
@@ -221,10 +213,10 @@ class SearchRange(NamedTuple):
 
     @classmethod
     def parse(cls, text: str, tolerance: float = MARGIN_TOLERANCE) -> "SearchRange":
-        """Parses the setting and range of a search for limits, such as "control.d=0.2:3".
+        """Parses the key and range of a search for stability edges, such as "control.d=0.2:3".
 
         Args:
-            text: Text of the form KEY=FROM:TO.
+            text: String of the form KEY=FROM:TO.
             tolerance: Largest width of an edge, as a fraction of its value.
 
         Raises:
@@ -275,21 +267,19 @@ class _MarginItem(NamedTuple):
 
 
 class GridPointMargin(NamedTuple):
-    """Limits of stability along one scenario key, at one grid point of a sweep.
+    """Stability edges along one scenario key, at one grid point of a sweep.
 
-    A grid point is a combination of the other swept parameters. A limit is a value of the key
-    at which the arms change from stable to not stable or back.
+    A grid point is a combination of the other swept parameters.
 
     Attributes:
         cell: The grid point.
-        seed: Seed of its runs.
-        margin: The limits that were found by runs.
-        linear: The limits within the range at which the linearised loop becomes unstable, in
-            rising order.
-        remark: Remark on the linear analysis. Empty if there is no remark.
-        closed: The limit within the range according to a stability criterion in closed form.
-            `None` if no criterion applies, or if the limit of the criterion lies outside the
-            range.
+        seed: Random seed of its runs.
+        margin: The edges found by running the scenario.
+        linear: The values within the range at which the linearised loop becomes unstable, in
+            ascending order.
+        remark: Remark on the linear analysis. May be empty.
+        closed: The edge within the range according to a closed-form stability criterion. `None`
+            if no criterion applies, or if its edge lies outside the range.
     """
 
     cell: SweepCell
@@ -318,16 +308,16 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
-        """Returns the scenario of the grid point with a given value of the searched key.
+        """Loads the scenario of the grid point with a given value of the searched key.
 
         Args:
-            value: Value of the scenario key along which the limit of stability is searched.
+            value: Value of the searched key.
         """
         override = f"{key}={format_override_value(value)}"
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def is_stable(value: float) -> bool | None:
-        """Simulates the scenario with a value of the searched parameter, and judges the run.
+        """Simulates the scenario with a given value of the searched key and judges the run.
 
         Args:
             value: Value of the searched key.
@@ -348,7 +338,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     closed = StabilityCriterion.find_edge(
         lambda value: StabilityCriterion.evaluate(load(value)), low, high
     )
-    linear, remark = find_root_crossings(load(high), key, low, high)
+    linear, remark = GrowthColumn.find_crossings(load(high), key, low, high)
     return GridPointMargin(
         cell=task.cell,
         seed=task.seed,
@@ -369,16 +359,15 @@ def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True, repr=False)
 class SweepMargins(Result):
-    """Result of a search for the limits of stability along one scenario key.
+    """Stability edges along one scenario key, for each grid point and random seed of a sweep.
 
-    The search is repeated at each grid point of a sweep, which is a combination of other
-    parameters, and for each random seed.
+    A grid point is a combination of the other swept parameters.
 
     Attributes:
         plan: The sweep. Its last axis is the searched key with two values, the ends of the
             range.
         within: The searched key and its range.
-        found: The limits at each grid point and for each seed, in the order of the grid.
+        found: The edges at each grid point and for each seed, in the order of the grid.
     """
 
     plan: SweepPlan
@@ -394,17 +383,17 @@ class SweepMargins(Result):
         progress: Progress = ignore_progress,
         on: Workers = None,
     ) -> "SweepMargins":
-        """Finds the limits of stability along one scenario key, at each grid point of a sweep.
+        """Finds the stability edges along one scenario key, at each grid point of a sweep.
 
-        A grid point is a combination of the other swept parameters. A limit, called edge, is a
-        value of the key at which runs change from stable to not stable or back.
+        A grid point is a combination of the other swept parameters. An edge is a value of the
+        searched key at which runs change from stable to not stable or back.
 
         Args:
             plan: The sweep. Its last axis must be the searched key with two values, the ends of
-                the range, as from `SearchRange.format_axis`.
+                the range, as returned by `SearchRange.format_axis`.
             within: The searched key and its range.
-            jobs: Number of worker processes. If `None`, all cores are used.
-            progress: Function that is called with the number of finished grid points and of all
+            jobs: Number of worker processes. If `None`, one per core.
+            progress: Called with the number of completed grid points and the total number of
                 grid points.
             on: Workers to use instead of processes on this computer.
 
@@ -428,17 +417,14 @@ class SweepMargins(Result):
             searches += [_MarginItem(plan, grid_point, seed, within) for seed in seeds]
 
         # The workers need the files of control laws that users wrote.
-        laws = list_imported_code([plan.base])
-        with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
+        laws = plan.base.imported_code
+        with WorkerPool.open(jobs, on, most=len(searches), laws=laws) as pool:
             found = pool.map(_search_margin_task, searches, progress)
         return cls(plan, within, found)
 
     @property
     def command(self) -> str:
-        """Shell command that repeats this search for limits of stability.
-
-        The web page with the results shows the command, so that a user can copy it.
-        """
+        """Shell command that repeats this search, shown on the results page for copying."""
         low = format_override_value(self.within.low)
         high = format_override_value(self.within.high)
         tolerance = format_override_value(self.within.tolerance)
@@ -447,12 +433,11 @@ class SweepMargins(Result):
         return plan.build_command("--margin", search_range, "--tolerance", tolerance)
 
     def table(self) -> TextTable:
-        """Returns a table of the limits of stability along the searched key, one row per limit.
+        """Returns a table with one row per stability edge.
 
-        The columns are the values of the other swept parameters, the limit from runs, and the
-        limits from the linear analysis and from a closed-form stability criterion. For each
-        limit from theory, its difference from the limit of the runs is also shown. If a
-        combination of the other parameters has no limit, it has a single row.
+        The columns are the values of the other swept parameters, the edge from runs, the edges
+        from the linear analysis and from a closed-form criterion, and the difference of each
+        theoretical edge from that of the runs. A grid point without an edge also has one row.
         """
         plan = self.plan
         several_seeds = len({point.seed for point in self.found}) > 1
@@ -490,11 +475,11 @@ class SweepMargins(Result):
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields a table of the limits of stability, as simulated and as predicted."""
+        """Yields a table of the simulated and the predicted stability edges."""
         yield self.table()
 
     def headline(self) -> str:
-        """Returns a sentence with the number of limits of stability, and the searched range.
+        """Returns a sentence with the number of stability edges and the searched range.
 
         Example: "paper: 2 edges of control.d from 0 to 40".
         """
@@ -507,10 +492,10 @@ class SweepMargins(Result):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat sweep --margin --json` prints it.
+        """Converts the result to the plain values that `trilat sweep --margin --json` prints.
 
-        The key "places" has an entry for each grid point, and "command" is the command that
-        repeats the search.
+        The key "places" has one entry per grid point, and "command" is the command that repeats
+        the search.
         """
         return {
             "command": self.command,
@@ -545,9 +530,9 @@ class SweepMargins(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of plain values, one row per limit of stability.
+        """Returns a table of plain values, with one row per stability edge.
 
-        A combination of the other swept parameters without a limit has one row, too.
+        A grid point without an edge also has one row.
         """
         rows = list[dict[str, Any]]()
         for point in self.to_dict()["places"]:
@@ -559,10 +544,10 @@ class SweepMargins(Result):
         return rows
 
     def page(self) -> str:
-        """Returns a Markdown page that reports the limits of stability along the searched key.
+        """Returns a Markdown page that reports the stability edges along the searched key.
 
-        The page contains the command that repeats the search, a table of the limits, remarks of
-        the linear analysis, and the gains that the runs have in common.
+        The page contains the command that repeats the search, a table of the edges, remarks on
+        the linear analysis, and the gains that all runs have in common.
         """
         base = self.plan.base
         parts = [f"# {base.title or base.name}: margin", f"```sh\n{self.command}\n```"]
@@ -583,7 +568,7 @@ class SweepMargins(Result):
         return "\n\n".join(parts) + "\n"
 
     def write(self, folder: Path) -> list[Path]:
-        """Writes the limits of stability into an existing folder, as margin.json and margin.md.
+        """Writes the stability edges into an existing folder, as margin.json and margin.md.
 
         Args:
             folder: The folder.

@@ -1,12 +1,12 @@
-"""Writes and reads results.csv, the table of a sweep with one row per run, row by row.
+"""Reads and writes results.csv, the table of a sweep with one row per run.
 
-A sweep may have millions of runs, whose rows need more memory than a machine has. Therefore,
-rows are written one by one, and a large table stays in its file while it is used. `ResultTable`
-builds the row of a finished run, with the command that repeats the run.
+A sweep may have millions of runs, more than fit into memory. Rows are therefore written one by
+one, and a large table stays on disk while it is used. `ResultTable` builds the row of a
+finished run, including the command that repeats the run.
 
 Invariant:
     - Reading the CSV table restores all numbers bit for bit.
-    - A row in memory and the same row in the file are equal.
+    - A row in memory equals the same row in the file.
 """
 
 import csv
@@ -51,11 +51,11 @@ def encode_table(
     """Yields a table as CSV text line by line, so that a large table needs little memory.
 
     Args:
-        rows: The rows, as values by column.
-        column_types: The columns in their order, each with the type of its values.
+        rows: The rows, each a mapping from column name to value.
+        column_types: Column names in order of output, mapped to the type of their values.
 
     Yields:
-        The header, and the text of each row. Numbers can be read from it bit for bit.
+        The header line, then one line per row. Numbers can be read back bit for bit.
     """
     columns = list(column_types)
     yield encode_csv([], columns)
@@ -65,12 +65,12 @@ def encode_table(
 
 
 class ResultTable:
-    """Columns of the file results.csv of a parameter sweep, to write and read its rows.
+    """Columns of a sweep's results.csv, for writing and reading its rows.
 
-    Each swept parameter has a column, so the columns depend on the sweep.
+    The columns depend on the sweep, since there is one per swept parameter.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
@@ -80,14 +80,14 @@ class ResultTable:
 
     @property
     def columns(self) -> list[str]:
-        """Names of all columns of the table of a sweep, in the order of the CSV file."""
+        """Names of all columns, in the order of the CSV file."""
         return [*self._kinds, _SCENARIO_COLUMN]
 
     def encode(self, rows: Iterable[ResultRow]) -> Iterator[str]:
-        """Yields the CSV text of a sweep's results: a header, then the text of each row.
+        """Yields the results as CSV text: the header line, then one line per row.
 
         Args:
-            rows: The runs, one mapping from columns to values per run.
+            rows: The rows, one per run, each a mapping from column name to value.
         """
         column_types = {**self._kinds, _SCENARIO_COLUMN: str}
         yield from encode_table(map(self._add_changes, rows), column_types)
@@ -98,10 +98,10 @@ class ResultTable:
         return {**row, _SCENARIO_COLUMN: json.dumps(changes, ensure_ascii=False)}
 
     def parse(self, line: Mapping[str, str]) -> ResultRow:
-        """Returns the results in one line of a CSV table, with the scenario's full text.
+        """Converts one line of the CSV table to a row, with the full text of the scenario.
 
         Args:
-            line: Texts of the line, by column.
+            line: Mapping from column name to the string in the file.
         """
         row = {name: _parse_cell(line[name], kind) for name, kind in self._kinds.items()}
         # A run that was not simulated has no motion.
@@ -115,7 +115,7 @@ class ResultTable:
         return row
 
     def read_rows(self, file: Path) -> Sequence[ResultRow]:
-        """Reads the results of a parameter sweep. The rows of a large table stay in the file.
+        """Reads the results of a sweep. The rows of a large table stay on disk.
 
         Args:
             file: The CSV table.
@@ -129,7 +129,8 @@ class ResultTable:
     def iterate_cells(self, done: Mapping[tuple[int, int], CellRun]) -> Iterator[list[CellRun]]:
         """Yields the finished runs of each cell, ordered by cell and then by seed.
 
-        Worker processes finish in any order, on which the results must not depend.
+        The fixed order makes the results independent of the order in which worker processes
+        finish.
 
         Args:
             done: The finished runs, by cell and seed.
@@ -142,7 +143,7 @@ class ResultTable:
             yield [done[cell, seed] for seed in seeds if (cell, seed) in done]
 
     def build_rows(self, runs: Sequence[CellRun]) -> Iterator[ResultRow]:
-        """Yields the results of one combination of swept parameters, one row per simulation.
+        """Yields the results of one cell, with one row per run.
 
         Args:
             runs: All finished runs of the cell.
@@ -189,10 +190,9 @@ class ResultTable:
 
 
 class StoredRows(Sequence[ResultRow]):
-    """Rows of results.csv that stay in the file, for tables that are larger than the memory.
+    """Rows of a results.csv that is too large for memory, read from disk on demand.
 
-    The object can be used like a list. A row is read when it is needed. Only the offsets of the
-    rows are in memory, 8 bytes for each.
+    The object can be used like a list. Only the offset of each row (8 bytes) is kept in memory.
 
     Args:
         file: The CSV table.
@@ -262,7 +262,7 @@ class StoredRows(Sequence[ResultRow]):
     __hash__ = None  # type: ignore[assignment]
 
     def find_cell(self, number: int) -> list[ResultRow]:
-        """Reads the results of one combination of parameters, one row per random seed.
+        """Reads the results of one cell, with one row per random seed.
 
         Args:
             number: Number of the cell.

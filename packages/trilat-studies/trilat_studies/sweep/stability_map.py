@@ -1,13 +1,13 @@
 """Builds a stability map, which shows for which parameters a scenario is stable.
 
-A sweep runs one scenario at every point of a grid of parameters, usually with several random
-seeds. The map draws the first two numeric parameters as axes x and y. Each combination of the
-other parameters and of the control law gets a panel. Each grid point of a panel shows how many
-of its runs were stable. A column is the set of grid points with the same x.
+The map presents the results of a sweep. Its axes x and y are the first two numeric parameters,
+and each combination of the other parameters and the control law gets its own panel. Each grid
+point of a panel shows how many of its runs were stable. A column is the set of grid points with
+the same x.
 
-Limits from theory are drawn as lines, so that they can be compared with the runs:
+Theoretical limits are drawn as lines for comparison with the runs:
 
-- The closed-form line is where a stability criterion in closed form is just met. It is used
+- The closed-form line is where a closed-form stability criterion is only just met. It is used
   only if all assumptions of the criterion hold. For the proportional law with damping, P+d, the
   line accounts for sampling.
 - The linear line is where the rightmost characteristic root of the linearised loop crosses the
@@ -15,10 +15,10 @@ Limits from theory are drawn as lines, so that they can be compared with the run
 
 Invariant:
     - The measurements come only from the results, and the lines only from the plan.
-    - Every run is counted at exactly one grid point. The majority of the decided runs decides
-      whether a grid point is stable. A draw leaves the point undecided.
+    - Every run is counted at exactly one grid point. A grid point is stable if the majority of
+      its decided runs is. A tie leaves the point undecided.
     - A measured edge lies between two decided grid points of a column, one of them stable and
-      the other not. If undecided grid points lie between the two, the edge is wider.
+      the other not. Undecided grid points between the two make the edge wider.
     - A line crosses a column between two neighbouring grid points if exactly one of them is
       stable according to theory.
 """
@@ -32,18 +32,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.analysis import GrowthColumn, PlacedArm
+from trilat_net.analysis import GrowthColumn, build_arm_rows
 from trilat_net.core import Array, DominanceMatrix
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive
 from trilat_net.scenario import (
-    ArmModel,
     LinkBase,
     Scenario,
     SiteSpec,
     is_number,
 )
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 
 from ..run_commands import format_override_value
 from .fixed_gains import describe_fixed_gains
@@ -68,8 +67,8 @@ class PlaneAxis(NamedTuple):
     Attributes:
         key: Scenario key that varies along the axis, such as "link.delay_ms". Empty for the
             vertical axis of a map with a single numeric axis.
-        values: Values of the key in rising order, in the unit of the key.
-        label: Text at the axis, with the unit.
+        values: Values of the key in ascending order, in the unit of the key.
+        label: Axis label, with the unit.
     """
 
     key: str
@@ -78,9 +77,9 @@ class PlaneAxis(NamedTuple):
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the values on an axis of the map are equally spaced, up to rounding.
+        """True if the values on the axis are equally spaced, up to rounding.
 
-        The property is also true for fewer than three values.
+        Also true for fewer than three values.
         """
         steps = np.diff(self.values)
         if len(steps) < 2:
@@ -90,19 +89,19 @@ class PlaneAxis(NamedTuple):
 
     @property
     def positions(self) -> Array:
-        """Positions at which the K swept values are drawn along an axis of a map, shape (K,).
+        """Positions along the axis at which the K swept values are drawn, shape (K,).
 
-        Equally spaced values are drawn at their own positions. Other values, such as 1, 10,
-        100, are drawn at equal distances, at their indices.
+        Equally spaced values are drawn to scale. Other values, such as 1, 10, 100, are drawn at
+        equal distances, at their indices.
         """
         if self.is_evenly_spaced:
             return np.array(self.values)
         return np.arange(len(self.values), dtype=np.float64)
 
     def compute_borders(self) -> Array:
-        """Returns the borders of a map's cells along an axis, halfway between the swept values.
+        """Returns the borders of the cells along the axis, halfway between the swept values.
 
-        If all values are at least zero, so are the borders, because a delay of -100 ms, for
+        If no value is negative, no border is negative either, because a delay of -100 ms, for
         example, does not exist.
 
         Returns:
@@ -122,11 +121,11 @@ class PlaneAxis(NamedTuple):
         return borders
 
     def refine_columns(self) -> "_FineColumns":
-        """Returns x values for lines from theory, with a finer spacing than the map's columns.
+        """Returns x values for theoretical lines, spaced more closely than the map's columns.
 
-        The intervals between the columns are divided, unless there are many columns already. If
-        the values are equally spaced, values beside the outer columns let lines reach the
-        borders of the map.
+        The intervals between the columns are subdivided unless there are already many columns.
+        If the values are equally spaced, additional values outside the outermost columns extend
+        the lines to the borders of the map.
         """
         values = np.array(self.values)
         positions = self.positions
@@ -161,9 +160,7 @@ class PlaneAxis(NamedTuple):
         )
 
     def thin_out(self, halvings: int) -> "PlaneAxis":
-        """Returns the values of an axis that belong to the coarse grid of a refined sweep.
-
-        Such a sweep begins with this grid, and then halves it along the edge of stability.
+        """Returns the axis values in the coarse grid with which a refined sweep begins.
 
         Args:
             halvings: Number of halvings of the refined sweep. If 0, the whole axis is returned.
@@ -178,20 +175,19 @@ class PlaneAxis(NamedTuple):
 class MapPanel(NamedTuple):
     """One panel of a stability map: a grid of runs over the two drawn axes.
 
-    A sweep may vary more keys than a picture has axes. All runs of a panel have the same
-    setting of these other keys.
+    Any further swept keys have the same values for all runs of a panel.
 
     Attributes:
-        title: The setting as a string, such as "p d, delay 200 ms". Empty if there are no such
-            axes.
-        settings: The setting as pairs of a key and a value. The key of a swept law is "law".
+        title: The values of these keys as a string, such as "p d, delay 200 ms". Empty if there
+            are no such keys.
+        settings: The same as pairs of a key and a value. The key of a swept law is "law".
         counts: Number of runs for each grid point and class, shape (y, x, 4). The classes are
             in the order of `CELL_CLASSES`.
-        exponents_per_s: Growth exponent of each grid point, the mean over its seeds, in 1/s,
-            shape (y, x). It is the rate at which a small disturbance grows; NaN if it was not
+        exponents_per_s: Growth exponent of each grid point (the rate at which a small
+            disturbance grows), averaged over its seeds, in 1/s, shape (y, x). NaN if it was not
             measured.
-        simulated: Measured limits of stability from another sweep, whose cells were simulated.
-            They are pairs of a value of x and an interval of y.
+        simulated: Stability edges measured in another, simulated sweep, as pairs of a value of
+            x and an interval of y.
     """
 
     title: str
@@ -202,16 +198,16 @@ class MapPanel(NamedTuple):
 
     @property
     def runs(self) -> RunCounts:
-        """Number of simulations at each grid point of a map, decided or not, shape (y, x).
+        """Number of runs at each grid point, decided or not, shape (y, x).
 
-        The simulations of a point differ in their random seeds.
+        The runs at a grid point differ in their random seeds.
         """
         total: RunCounts = self.counts.sum(axis=2)
         return total
 
     @property
     def stable(self) -> RunCounts:
-        """Number of simulations at each grid point that were judged stable, shape (y, x)."""
+        """Number of runs at each grid point that were judged stable, shape (y, x)."""
         is_stable = [verdict.stable is True for verdict in CELL_CLASSES]
         stable: RunCounts = self.counts[:, :, is_stable].sum(axis=2)
         return stable
@@ -220,7 +216,7 @@ class MapPanel(NamedTuple):
     def decided(self) -> RunCounts:
         """Number of runs at each grid point that are stable or not stable, shape (y, x).
 
-        The other runs are undecided, for example because they were too short.
+        All other runs are undecided, for example because they were too short.
         """
         class_index = CELL_CLASSES.index(CellClass.UNDECIDED)
         undecided = self.counts[:, :, class_index]
@@ -228,11 +224,9 @@ class MapPanel(NamedTuple):
 
     @property
     def share(self) -> Array:
-        """Fraction of simulations that are stable, at each grid point of a panel of the map.
+        """Fraction of decided runs that are stable, at each grid point, shape (y, x).
 
-        Undecided simulations, for example too short ones, are left out. The fraction is NaN if
-        all simulations of a grid point are undecided. The shape is (number of y values, number
-        of x values).
+        NaN if all runs of a grid point are undecided.
         """
         stable = self.stable
         decided = self.decided
@@ -241,16 +235,16 @@ class MapPanel(NamedTuple):
         return share
 
     def fill_gaps(self) -> "MapPanel":
-        """Fills the grid points that a refined sweep did not run, so that a map can be drawn.
+        """Fills in the grid points that a refined sweep did not run, for drawing the map.
 
         Such a point gets the class of the nearest point that was run. Growth exponents are
-        interpolated linearly between the grid points that have an exponent.
+        interpolated linearly between grid points that have one.
         """
         from scipy.interpolate import griddata
         from scipy.ndimage import distance_transform_edt
 
         def find_nearest(is_missing: Any) -> Any:
-            """Returns for each grid point the indices of the nearest point with a result."""
+            """Returns, for each grid point, the indices of the nearest point with a result."""
             return distance_transform_edt(
                 is_missing, return_distances=False, return_indices=True
             )
@@ -276,18 +270,18 @@ class MapPanel(NamedTuple):
         return self._replace(counts=self.counts[rows, columns], exponents_per_s=exponents_per_s)
 
     def make_loader(self, plan: SweepPlan, x: str, y: str) -> "PanelLoader":
-        """Returns a function that loads the scenario at any point of a panel.
+        """Returns a function that loads the scenario at any point of the panel.
 
-        The lines from theory also need scenarios between the grid points of the sweep. The
-        function can be pickled, so that other processes can call it.
+        Theoretical lines need scenarios between the grid points of the sweep as well. The
+        function can be pickled and called in other processes.
 
         Args:
-            plan: The sweep: its scenario, axes, control laws and seeds.
+            plan: The sweep.
             x: Scenario key of the horizontal axis.
             y: Scenario key of the vertical axis.
 
         Returns:
-            Function of the values of x and y that returns the scenario.
+            A function that takes the values of x and y and returns the scenario.
         """
         settings = dict(self.settings)
         only_law = next(iter(plan.laws), "")
@@ -300,10 +294,10 @@ class MapPanel(NamedTuple):
 
 
 class MapPlane(NamedTuple):
-    """Results of the simulations in a stability map: panels over the same two parameters.
+    """Simulation results of a stability map: panels over the same two parameters.
 
-    If only one swept parameter has numeric values, the vertical axis y has an empty key and a
-    single value.
+    If only one swept parameter is numeric, the vertical axis y has an empty key and a single
+    value.
 
     Attributes:
         scenario: Name of the swept scenario.
@@ -312,7 +306,8 @@ class MapPlane(NamedTuple):
         panels: One panel per setting of the axes that are not drawn.
         halvings: Number of halvings of a sweep that ran only the grid points along the
             stability edge. 0 if all grid points have runs.
-        is_linear: True if the exponents are roots of the linear loop, and nothing was run.
+        is_linear: True if the exponents are roots of the linearised loop and nothing was
+            simulated.
         refused: Number of grid points that are not valid scenarios. They have no runs.
     """
 
@@ -326,34 +321,31 @@ class MapPlane(NamedTuple):
 
     @property
     def has_exponents(self) -> bool:
-        """True if the map shows how fast disturbances grow, instead of how each run ended.
+        """True if the map shows how fast disturbances grow, rather than how each run ended.
 
-        The rate at which a small disturbance grows, in 1/s, is called the growth exponent. It
-        is measured by repeating a run with a small push, or it is a root of the linear loop.
+        The growth exponent, in 1/s, is the rate at which a small disturbance grows. It is
+        measured by repeating a run with a small push, or is a root of the linearised loop.
         """
         return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
 
     @property
     def seeds(self) -> int:
-        """Largest number of simulations at a grid point, which differ in their random seeds.
-
-        It is 1 if the sweep has a single seed.
-        """
+        """Largest number of runs at any grid point. 1 if the sweep has a single seed."""
         return max(int(panel.runs.max()) for panel in self.panels)
 
     def find_edges(self, panel: MapPanel) -> "list[tuple[float, StabilityEdge]]":
-        """Finds the measured limits of stability along the vertical axis of a stability map.
+        """Finds the measured stability edges along the vertical axis of a panel.
 
-        In each column, which is a value of x, the grid points are compared in the order of y. A
-        limit lies between two grid points if the majority of the runs is stable at one of them
-        and not stable at the other. Grid points without a majority are skipped.
+        In each column, an edge lies between two consecutive grid points if the majority of the
+        runs is stable at one of them and not stable at the other. Grid points with no majority
+        are skipped.
 
         Args:
-            panel: Part of the map with the counts of stable runs at each grid point.
+            panel: Panel of the map with the counts of stable runs at each grid point.
 
         Returns:
-            Pairs of the x value of a column and an interval of y that contains a limit. The
-            limits of a column are in rising order.
+            Pairs of the x value of a column and an interval of y that contains an edge. The
+            edges of a column are in ascending order.
         """
         edges = []
         y = self.y.values
@@ -386,19 +378,18 @@ class MapPlane(NamedTuple):
     ) -> "MapPlane":
         """Arranges the runs of a sweep for a map over two of the swept parameters.
 
-        The axes are the first two swept keys with numeric values. Each combination of the other
-        keys gets a panel of its own. Rows are read one after the other, so they need not fit
-        into memory.
+        The first two swept keys with numeric values become the axes. Each combination of the
+        other keys gets its own panel. Rows are read one by one, so they need not fit into
+        memory.
 
         Args:
-            rows: One mapping per run. It has a value for each swept key, the result of the run
-                under the key "verdict", such as "converged", and possibly the rate at which a
-                disturbance grows under "exponent_per_s".
-            axes: The swept keys, in the order of the sweep. The key "law" means the control
-                law, if several laws were swept.
-            scenario: The swept scenario, from which the labels are taken.
-            grid: All values of each swept key. If `None`, the values are collected from the
-                rows.
+            rows: One mapping per run, with a value for each swept key and the result of the run
+                under the key "verdict", such as "converged". It may also contain the rate at
+                which a disturbance grows, under "exponent_per_s".
+            axes: The swept keys, in the order of the sweep. The key "law" stands for the
+                control law, if several laws were swept.
+            scenario: The swept scenario, used for labels.
+            grid: All values of each swept key. If `None`, they are collected from the rows.
 
         Returns:
             The axes and the panels.
@@ -478,7 +469,7 @@ class _PanelRuns:
         self.counts: RunCounts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
 
     def add(self, run: Mapping[str, Any]) -> None:
-        """Counts a finished simulation at its grid point of the map.
+        """Counts a finished run at its grid point of the map.
 
         Args:
             run: A row for `MapPlane.arrange_rows`.
@@ -492,9 +483,9 @@ class _PanelRuns:
         self._sums_per_s[row, column] += np.nan if exponent is None else exponent
 
     def compute_exponents(self) -> Array:
-        """Returns the mean rate at which a small disturbance grows, for each grid point.
+        """Returns the mean growth rate of small disturbances at each grid point, in 1/s.
 
-        The rate is negative where disturbances decay, see `MapPanel`.
+        Negative rates mean that disturbances decay, see `MapPanel`.
         """
         runs = self.counts.sum(axis=2)
         exponents_per_s: Array = self._sums_per_s / np.maximum(runs, 1)
@@ -523,17 +514,13 @@ def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
 
 
 class StabilityEdge(NamedTuple):
-    """An edge of stability along one parameter: where stable and unstable values meet.
-
-    The edge is known only up to an interval, because the parameter has a finite number of
-    values.
+    """An edge between stable and unstable values of a parameter, located up to an interval.
 
     Attributes:
         low: Largest decided value below the edge.
         high: Smallest decided value above the edge.
-        stable_below: True if the values below the edge are stable, False if the values above it
-            are.
-        sharp: True if the interval contains no undecided value.
+        stable_below: True if the values below the edge are stable, False if those above it are.
+        sharp: True if there is no undecided value between `low` and `high`.
     """
 
     low: float
@@ -543,10 +530,7 @@ class StabilityEdge(NamedTuple):
 
     @property
     def middle(self) -> float:
-        """Centre of the interval in which the limit of stability lies.
-
-        The unit is that of the parameter along which the limit was searched for.
-        """
+        """Midpoint of the interval that contains the edge, in the unit of the parameter."""
         return 0.5 * (self.low + self.high)
 
 
@@ -557,10 +541,10 @@ _ROUNDING = 1e-6
 
 
 class StabilityCriterion(NamedTuple):
-    """A stability condition in closed form, evaluated for one scenario.
+    """A closed-form stability condition, evaluated for one scenario.
 
-    The condition is an inequality from theory between parameters of the scenario, such as a
-    gain and a delay.
+    The condition is a theoretical inequality between scenario parameters, such as a gain and a
+    delay.
 
     Attributes:
         symbol: Equation of the limit of the condition, in TeX, for the legend of a figure.
@@ -579,17 +563,17 @@ class StabilityCriterion(NamedTuple):
     def evaluate(cls, scenario: Scenario) -> "StabilityCriterion | None":
         """Evaluates the closed-form stability condition that applies to a scenario.
 
-        For example, equal arms under the law P+d are stable if the damping exceeds a certain
-        multiple of the stiffness times the delay. A map shows where the condition is just met,
-        beside the measured edge.
+        For example, identical arms under the law P+d are stable if the damping exceeds a
+        certain multiple of the stiffness times the delay. A map shows the points at which the
+        condition is only just met, alongside the measured edge.
 
         Args:
             scenario: The scenario to which the condition is applied.
 
         Returns:
-            The condition. `None` if the scenario violates a hypothesis of every known
-            condition, for example because a parameter changes during the run, or because a site
-            stops following a peer whose samples are too old.
+            The condition, or `None` if the scenario violates an assumption of every known
+            condition. This is the case if, for example, a parameter changes during the run, or
+            a site stops following a peer whose samples are too old.
         """
         stops_following = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
         if scenario.timeline or stops_following:
@@ -608,20 +592,19 @@ class StabilityCriterion(NamedTuple):
     def find_edge(
         criterion: "Callable[[float], StabilityCriterion | None]", low: float, high: float
     ) -> float | None:
-        """Finds the value of a parameter at which a stability condition is just met.
+        """Finds the parameter value at which a stability condition is only just met.
 
         The value is located with Brent's method.
 
         Args:
-            criterion: Function that evaluates the criterion at a value. It may raise
-                ScenarioError for a value that is not valid, such as a fraction where a whole
-                number is needed.
+            criterion: Evaluates the criterion at a value. May raise ScenarioError for a value
+                that is not valid, such as a fraction where an integer is needed.
             low: Lower end of the searched interval.
             high: Upper end of the searched interval.
 
         Returns:
-            The value. `None` if the criterion has the same sign at both ends, or if it does not
-            apply to a value between them.
+            The value, or `None` if the criterion has the same sign at both ends or does not
+            apply at a value between them.
         """
         # imported late: SciPy costs half a second, and most commands do not need it
         from scipy.optimize import brentq
@@ -679,7 +662,8 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
             return None
         K.append(gains[0])
         d.append(gains[1])
-    least_inertia = min(map(_bound_least_inertia, scenario.arms.values()))
+    arms = [build_arm_rows(scenario, site) for site in scenario.names]
+    least_inertia = min(arm.least_inertia_kg_m2 for arm in arms)
     if max(d) / rate_hz >= least_inertia:
         return None  # an arm is lighter than d h
 
@@ -857,21 +841,6 @@ def _compute_pair_excess(
     return float(2.0 * np.min(half_excess))  # doubled, because the delay is the mean of two
 
 
-def _bound_least_inertia(arm: ArmModel) -> float:
-    """Returns a lower bound on the eigenvalues of the inertia matrix M(q), in kg m^2.
-
-    The bound holds for all poses q. For the planar arm with two joints, the least eigenvalue
-    occurs at cos q2 = 1 or -1. For any other arm, the inertia of the drives is a lower bound.
-    """
-    if arm.chain is not None:
-        return min(joint.armature_kg_m2 for joint in arm.chain.joints)
-    poses = np.array([[0.0, 0.0], [0.0, np.pi]])
-    extreme_poses = PlacedArm(0.0, arm.lengths_m, poses)
-    inertia_matrices = extreme_poses.inertia_matrix(arm.theta).T
-    eigenvalues = np.linalg.eigvalsh(inertia_matrices)
-    return float(eigenvalues.min())
-
-
 def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | None:
     """Evaluates the condition on the tick period of the adaptive law.
 
@@ -990,18 +959,18 @@ def _keep_columns(axis: PlaneAxis) -> _FineColumns:
 class MapLine(NamedTuple):
     """A line on a stability map that separates stable from unstable parameters.
 
-    The line is where a quantity is zero. The quantity is given at the grid points, and is
-    interpolated linearly between neighbouring grid points with the same x.
+    The line is the zero of a quantity that is known at the grid points and interpolated
+    linearly between neighbouring grid points with the same x.
 
     Attributes:
         label: Name of the line for a legend, possibly with TeX.
         text: The same name as plain text.
         about: Explanation of the origin of the line.
         excess: The quantity at the grid points, shape (number of y values, number of x values).
-            It is positive on the stable side, and NaN where it is not known.
+            Positive on the stable side, NaN where it is unknown.
         rank: Index of the line style. -1 is the style of measured lines.
-        fine_positions: Positions along x of the columns between which the line is drawn.
-            Empty if these are the columns of the map.
+        fine_positions: Positions along x of the columns between which the line is drawn. Empty
+            if these are the columns of the map.
         fine_excess: The quantity at these columns, shape (number of y values, number of
             columns).
     """
@@ -1018,16 +987,16 @@ class MapLine(NamedTuple):
     def drawn_excess(self) -> Array:
         """The quantity whose zero is the line, at the columns between which the line is drawn.
 
-        The fine columns are used if the line was computed at them, otherwise the columns of the
-        map.
+        These are the fine columns if the line was computed there, and the columns of the map
+        otherwise.
         """
         return self.fine_excess if self.fine_positions else self.excess
 
     def thin_out(self, columns: _FineColumns) -> "MapLine":
-        """Divides a line of theory into points at a map's columns and points between them.
+        """Splits a theoretical line into the map's columns and the fine columns in between.
 
         Args:
-            columns: The columns at which the line is given.
+            columns: The columns at which the line was computed.
         """
         if len(columns.on_grid) == len(columns.values):
             return self
@@ -1039,10 +1008,10 @@ class MapLine(NamedTuple):
 
     @property
     def crosses_map(self) -> bool:
-        """True if this line lies between grid points of the map and is therefore visible.
+        """True if the line passes between grid points of the map and is therefore visible.
 
-        This is the case if any four neighbouring grid points all have a value, and only some of
-        them are on the stable side of the line.
+        This requires four neighbouring grid points at which the quantity is known and positive
+        at some but not all of them.
         """
         excess = self.drawn_excess
         lower = excess[:-1]
@@ -1060,16 +1029,14 @@ class MapLine(NamedTuple):
         return bool(crossed.any())
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
-        """Finds the values of y at which this line crosses a column of the map.
-
-        A column is the set of grid points with the same value of x.
+        """Finds the values of y at which the line crosses a column of the map.
 
         Args:
             column: Index of the column, from 0.
             y: Vertical axis of the map.
 
         Returns:
-            The values in rising order. Empty if the line does not cross the column.
+            The values in ascending order. Empty if the line does not cross the column.
         """
         values = y.values
         excess = self.excess[:, column].tolist()
@@ -1085,19 +1052,19 @@ class MapLine(NamedTuple):
     def trace_closed_form(
         cls, load: PanelLoader, x: PlaneAxis, y: PlaneAxis
     ) -> "MapLine | None":
-        """Finds the line on a map on which a closed-form stability condition is just met.
+        """Traces the line on which a closed-form stability condition is only just met.
 
-        The condition comes from theory, see `StabilityCriterion`. Where it changes between two
-        grid points with the same x, the crossing in y is located with Brent's method, because
-        the condition may be nonlinear.
+        See `StabilityCriterion` for the condition. If its sign changes between two grid points
+        with the same x, the crossing in y is located with Brent's method, because the condition
+        may be nonlinear.
 
         Args:
-            load: Function that returns the scenario at values of x and y.
+            load: Returns the scenario at given values of x and y.
             x: Horizontal axis of the map.
             y: Vertical axis of the map.
 
         Returns:
-            The line. `None` if no condition is known for the scenario, or if the line does not
+            The line, or `None` if no condition is known for the scenario or the line does not
             cross the map.
         """
         first_criterion: StabilityCriterion | None = None
@@ -1140,20 +1107,20 @@ class MapLine(NamedTuple):
     def trace_linear_analysis(
         cls, columns: Sequence[GrowthColumn], y: PlaneAxis
     ) -> "tuple[MapLine | None, list[str]]":
-        """Finds the line of the linear analysis, on one side of which the loop is stable.
+        """Traces the stability limit of the linearised control loop.
 
-        On this line of a map panel, small motions of the linearised control loop neither grow
-        nor decay: the real part of the rightmost characteristic root is zero. The line is
-        described by the decay rate of the motions at the grid points, in 1/s, which is the
-        negative of the growth rate. It is positive on the stable side, see `MapLine.excess`.
+        On this line, small motions neither grow nor decay: the real part of the rightmost
+        characteristic root is zero. The quantity of the line (see `MapLine.excess`) is the
+        decay rate of the motions in 1/s, the negative of the growth rate, which is positive on
+        the stable side.
 
         Args:
-            columns: Linear analysis of each column of the panel (grid points with the same x),
-                in the order of x. It contains growth rates, and precise positions of the limit.
+            columns: Linear analysis of each column of the panel, in the order of x, with growth
+                rates and precise positions of the limit.
             y: Vertical axis.
 
         Returns:
-            The line, or `None` if it does not cross the panel; and remarks of the analysis for
+            The line, or `None` if it does not cross the panel; and remarks on the analysis for
             the reader of the map, without duplicates.
         """
         decay_columns = []
@@ -1280,15 +1247,15 @@ LAW_AXIS = "law"
 
 
 class StabilityMap(NamedTuple):
-    """Map of stable and unstable parameters: simulated results and lines from theory.
+    """Map of stable and unstable parameters: simulation results and theoretical lines.
 
     Attributes:
         plane: The measurements, as panels.
         lines: Lines of each panel, in the order of the panels.
         remarks: Remarks on the lines for the reader of the map.
-        commands: Commands that create the map again.
+        commands: Commands that recreate the map.
         title: Title of the map's page.
-        fixed: Gains that were not swept, one text per control law.
+        fixed: Gains that were not swept, one string per control law.
     """
 
     plane: MapPlane
@@ -1310,23 +1277,21 @@ class StabilityMap(NamedTuple):
         on: Workers = None,
         simulated: SweepResults | None = None,
     ) -> "StabilityMap":
-        """Builds the stability map of a sweep: the results of its runs, and limits from theory.
+        """Builds the stability map of a sweep from its runs and from theoretical limits.
 
-        The map shows with which values of two parameters a scenario is stable. Limits from
-        theory are drawn as lines. They are computed only if the map has two numeric axes.
+        Theoretical limits are drawn as lines. They are computed only if the map has two numeric
+        axes.
 
         Args:
             results: Results of the sweep: its plan and one row per run.
-            commands: Commands that create the map. The page of the map shows them.
-            jobs: Number of worker processes for the linear analysis. If `None`, all cores are
-                used.
-            progress: Function that is called while the linear analysis runs.
-            linearly: True to add the line on which the linearised loop becomes unstable. This
-                line takes most of the time.
+            commands: Commands that create the map, quoted on the page of the map.
+            jobs: Number of worker processes for the linear analysis. If `None`, one per core.
+            progress: Called while the linear analysis runs.
+            linearly: True to add the line on which the linearised loop becomes unstable.
+                Computing this line takes most of the time.
             on: Workers that compute the linear analysis. If `None`, processes on this computer
                 are started.
-            simulated: Another sweep over the same axes, whose measured limits are drawn as
-                well.
+            simulated: Another sweep over the same axes, whose measured edges are drawn as well.
 
         Returns:
             The map.
@@ -1367,7 +1332,7 @@ class StabilityMap(NamedTuple):
         # The cells of a sweep that is judged linearly have the growth rates already.
         if linearly and not plane.is_linear:
             tasks = [(load, x_value, y) for load in loaders for x_value in fine.values]
-            with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+            with WorkerPool.open(jobs, on, most=len(tasks)) as pool:
                 columns = iter(pool.map(_analyse_column, tasks, progress))
             # The results come in the order of the tasks, panel by panel and column by column.
             for lines in panel_lines:
@@ -1448,7 +1413,7 @@ def _spread_line(
         return None
 
     def spread_rows(excess: Array) -> Array:
-        """Interpolates each column of numbers at the y values of the map."""
+        """Interpolates each column of the array at the y values of the map."""
         columns = [np.interp(plane.y.values, y.values, column) for column in excess.T]
         return np.array(columns).T
 

@@ -1,11 +1,12 @@
-"""Parses an axis of a sweep, a scenario key with the values that the sweep gives to the key.
+"""Parses the axes of a sweep, each of which is a scenario key with the values it takes.
 
-A user writes an axis as a text, such as "link.delay_ms=0:400:50". The names and units of a key,
-with which figures and tables label an axis, are defined here as well.
+Users write an axis as a string, such as "link.delay_ms=0:400:50". This module also defines the
+names and units that label an axis in figures and tables.
 
 Invariant:
     - The value of an axis is the text of an override, as a user would write it.
-    - Ranges are counted in decimal numbers: 0.2:3:0.1 contains 0.3, not 0.30000000000000004.
+    - Ranges are computed in decimal arithmetic: 0.2:3:0.1 contains 0.3, not
+      0.30000000000000004.
 """
 
 import math
@@ -62,12 +63,12 @@ class _Steps:
 
 
 class SweepAxis(NamedTuple):
-    """One swept scenario key with its values, as in "link.delay_ms=0:400:50".
+    """One swept scenario key with its values, such as "link.delay_ms=0:400:50".
 
     Attributes:
-        description: The axis as the user wrote it, as "KEY=a:b:step" or "KEY=v1,v2,v3".
-        key: Scenario key that the axis varies.
-        texts: Values of the axis, as texts that follow "KEY=" in an override.
+        description: The axis as the user wrote it, "KEY=a:b:step" or "KEY=v1,v2,v3".
+        key: Scenario key that varies along the axis.
+        texts: Values of the axis, as the strings that follow "KEY=" in an override.
     """
 
     description: str
@@ -81,7 +82,7 @@ class SweepAxis(NamedTuple):
             number: Index of the value, from 0.
 
         Returns:
-            A float if the value is a number. Otherwise its text.
+            A float if the value is a number, its text otherwise.
         """
         text = self.texts[number]
         value = _parse_value(text)
@@ -89,13 +90,13 @@ class SweepAxis(NamedTuple):
 
     @property
     def numeric(self) -> bool:
-        """True if all values of a swept parameter are numbers, as an axis of a map needs."""
+        """True if all values on the axis are numbers, which an axis of a map requires."""
         if isinstance(self.texts, _Steps):
             return True
         return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the text that sets one value of a swept parameter, as in "link.delay_ms=50".
+        """Returns the override for one value on the axis, such as "link.delay_ms=50".
 
         Args:
             number: Index of the value, from 0.
@@ -104,11 +105,11 @@ class SweepAxis(NamedTuple):
 
     @classmethod
     def parse(cls, description: str) -> "SweepAxis":
-        """Parses a swept parameter, as a user writes it, such as "link.delay_ms=0:200:10".
+        """Parses an axis as a user writes it, such as "link.delay_ms=0:200:10".
 
         Args:
-            description: Either "KEY=a:b:step", a range that includes b if a whole number of
-                steps leads to it; or "KEY=v1,v2,v3", a list of numbers, words or other TOML
+            description: Either a range "KEY=a:b:step", which includes b if b is a whole number
+                of steps from a; or a list "KEY=v1,v2,v3" of numbers, words or other TOML
                 values.
 
         Raises:
@@ -139,14 +140,14 @@ class SweepAxis(NamedTuple):
 
     @staticmethod
     def list_descriptions(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-        """Converts swept parameters, as a Python program may give them, to texts KEY=VALUES.
+        """Converts the axes passed by a Python program to strings KEY=VALUES.
 
         Args:
-            over: One text, a list of texts, or a mapping from keys to values. The values are a
-                list, an array, or the text after "KEY=".
+            over: A string, a list of strings, or a mapping from key to values. The values are a
+                list, an array, or the text that would follow "KEY=".
 
         Returns:
-            Texts for `parse`.
+            Strings for `parse`.
         """
         if isinstance(over, Mapping):
             return [f"{key}={_join_values(values)}" for key, values in over.items()]
@@ -297,8 +298,8 @@ _GAINS = {
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
     """Returns the label of an axis in a figure, such as "delay (ms)" for link.delay_ms.
 
-    If links draw their delays at random, the delay is called stated, because the age of the
-    samples in use is smaller: a newer sample may overtake an older one.
+    If links draw their delays at random, the label says "stated delay": a newer sample may
+    overtake an older one, so the samples in use are younger than this delay suggests.
 
     Args:
         key: Scenario key of the axis.
@@ -314,10 +315,10 @@ def label_axis(key: str, scenario: Scenario | None = None) -> str:
 
 
 def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str:
-    """Returns a setting as a label with unit, such as "delay 200 ms" for link.delay_ms = 200.
+    """Returns a setting as a label with its unit, such as "delay 200 ms".
 
     Args:
-        key: Scenario key.
+        key: Scenario key, such as link.delay_ms.
         value: Value of the key.
         scenario: Scenario in which the names of operators and walls are looked up.
     """

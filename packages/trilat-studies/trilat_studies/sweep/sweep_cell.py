@@ -1,16 +1,15 @@
-"""Runs one cell of a sweep in virtual time, and classifies how the run ends.
+"""Runs one cell of a sweep in virtual time and classifies how the run ends.
 
-A sweep runs one scenario, the description of an experiment, on a grid of parameters. A cell is
-one combination of these parameters. Its run is classified as converged, oscillating, diverged
-or undecided. A run that is undecided at the end of its duration is extended and classified
-again.
+A cell is one combination of the swept parameters. Its run is classified as converged,
+oscillating, diverged or undecided. If a run is still undecided at the end of its duration, it
+is extended and classified again.
 
 Invariant:
     - A result depends only on the cell's scenario and on the longest allowed duration.
-    - A log of the same run is judged in the same way, because both use
-      `judge.judge_virtual_run` and the roots of `loop_roots`.
-    - To save space, a run stores only how the text of its scenario differs from the text of the
-      sweep's scenario. The stored difference restores every text exactly.
+    - A log of the same run gets the same verdict, because both use `judge.judge_virtual_run`
+      and the roots of `loop_roots`.
+    - To save space, a run stores only the difference between the text of its scenario and that
+      of the sweep's scenario. The full text can be restored exactly.
 """
 
 import math
@@ -26,21 +25,19 @@ from trilat_net.analysis import (
     EndBehaviour,
     GrowthColumn,
     RunEnd,
-    RunTrace,
     Stability,
     find_run_roots,
     judge_virtual_run,
 )
 from trilat_net.execution import FusedRun
-from trilat_net.own_code import ImportedLaw
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
 
 
 class CellClass(StrEnum):
-    """Class of the end of a simulation in a parameter sweep, such as converged or undecided.
+    """Class of the end of a run in a sweep, such as converged or undecided.
 
-    The values are the words in tables and on pages.
+    The values are the words that appear in tables and on pages.
     """
 
     CONVERGED = "converged"
@@ -62,13 +59,13 @@ class CellClass(StrEnum):
 
     @classmethod
     def of_decision(cls, stability: Stability, behaviour: EndBehaviour) -> "CellClass":
-        """Returns the class of a run of a sweep, given the judgement of its stability.
+        """Returns the class of a run, given the verdict on its stability.
 
         A run that is stable or settled counts as converged. A run that is not stable counts as
-        diverged if it left its limits, drifts or grows, and otherwise as bounded.
+        diverged if it left its limits, drifts or grows, and as bounded otherwise.
 
         Args:
-            stability: The decision.
+            stability: The verdict.
             behaviour: How the run ends.
         """
         if stability in (Stability.STABLE, Stability.SETTLED):
@@ -88,22 +85,20 @@ _DIVERGING = (EndBehaviour.DIVERGED, EndBehaviour.DRIFTS, EndBehaviour.GROWS)
 
 
 class CellResult(msgspec.Struct, frozen=True):
-    """Result of one simulation of a parameter sweep: class of its end, and measured values.
+    """Result of one run of a sweep: how it ended, and its measured quantities.
 
-    Below, e is the error of a site (arm controller) against its reference, and qd the velocity
-    of a joint. A cell is a combination of parameter values.
+    Below, e is the error of a site against its reference, and qd the velocity of a joint.
 
     Attributes:
         verdict: Class of the cell.
         motion: Behaviour at the end, as in the stability certificate. It distinguishes growth
-            from divergence, and decay from convergence. `None` if there was no run, because the
-            cell is not a valid scenario or was judged by its linear loop. The measured values
-            of the run are then `None` as well.
-        ran_s: Duration of the run, in s, including extensions. It is shorter than planned if an
-            arm left its limits.
+            from divergence, and decay from convergence. If there was no run, because the cell
+            is not a valid scenario or was judged by its linearised loop, this and all measured
+            quantities are `None`.
+        ran_s: Duration of the run, in s, including extensions. Shorter than planned if an arm
+            left its limits.
         extended: Number of times that the duration was doubled.
-        end_error_rad: Largest |e| of the last second, in rad, where e is the error of a site
-            against its reference.
+        end_error_rad: Largest |e| of the last second, in rad.
         end_speed_rad_s: Largest |qd| of the last second, in rad/s.
         error_rate_per_s: Rate of the trend exp(rate t) of |e| over the second half of the run,
             in 1/s. `None` if there is no trend.
@@ -113,18 +108,17 @@ class CellResult(msgspec.Struct, frozen=True):
             0.01 rad at the end.
         diverged_s: Time at which the first site left its limits, in s. `None` if no site did.
         rms_error_rad: See `RunTotals`. The fields from this one to `walls_j` cover the
-            scenario's duration without extensions.
+            scenario's duration, excluding extensions.
         effort_nm: See `RunTotals`.
         force_peak_n: See `RunTotals`.
         walls_j: See `RunTotals`.
         reasons: Reasons why the run is undecided, or why its cell was rejected, as a string.
         exponent_per_s: Growth exponent over the scenario's duration, from twins (repetitions
-            with a small push), in 1/s, see `sweep_run`. `None` if there were no twins,
-            or if no twin moved. In a sweep that is judged linearly, it is the real part of the
-            rightmost root.
-        stability: The decision whether the run is stable, as in the stability certificate.
+            with a small push), in 1/s, see `sweep_run`. `None` if there were no twins, or if no
+            twin moved. In a sweep that is judged linearly, the real part of the rightmost root.
+        stability: The verdict on the stability of the run, as in the stability certificate.
             Empty in results of older versions.
-        rests_on: Evidence for the decision, for example exact roots. Empty in results of older
+        rests_on: Evidence for the verdict, for example exact roots. Empty in results of older
             versions.
     """
 
@@ -150,7 +144,7 @@ class CellResult(msgspec.Struct, frozen=True):
 
     @classmethod
     def unsimulated(cls, verdict: CellClass, reasons: str) -> "CellResult":
-        """Returns the result of a parameter combination that was decided without a simulation.
+        """Creates the result of a cell that was decided without a simulation.
 
         Args:
             verdict: Class of the cell.
@@ -174,11 +168,10 @@ class CellResult(msgspec.Struct, frozen=True):
 
     @classmethod
     def judge_linearly(cls, scenario: Scenario) -> "CellResult":
-        """Decides without a simulation whether a parameter combination is stable.
+        """Judges the stability of a cell from its linearised loop, without a simulation.
 
-        The linearised control loop is stable if the real parts of all its characteristic roots
-        are negative. The result is undecided if the scenario has no linear loop, or if nothing
-        moves.
+        The loop is stable if all its characteristic roots have negative real parts. The result
+        is undecided if the scenario has no linearised loop, or if nothing moves.
 
         Args:
             scenario: Scenario of the cell.
@@ -206,7 +199,7 @@ class CellResult(msgspec.Struct, frozen=True):
 
         This is the case if one of the following conditions is met:
 
-        - An arm left its limits, the arms came to rest, or they drift.
+        - An arm left its limits, or the arms came to rest or drift.
         - The motion grows with a pronounced trend: over the second half of the run, the largest
           speed doubled, or error and speed both halved.
         - The motion is bounded and steady: over the second half of the run, the logarithms of
@@ -232,10 +225,10 @@ FLAT_LOG_CHANGE = 0.02
 
 
 def check_sweepable(scenario: Scenario) -> None:
-    """Checks that a scenario can be run in a sweep.
+    """Raises ScenarioError if a scenario cannot be run in a sweep.
 
-    A sweep runs in virtual time in the compiled loop. Scenarios that need a live network, or
-    that this loop cannot run, are rejected.
+    Sweeps run in virtual time in the compiled loop. Scenarios that need a live network, or that
+    the compiled loop cannot run, are rejected.
 
     Args:
         scenario: The scenario.
@@ -268,10 +261,10 @@ class _CellInProgress:
         self.run = FusedRun(scenario, SETTLED_ERROR_RAD)
 
     def note_first_end(self) -> None:
-        """Judges the simulation at the end of the planned duration, before any extension.
+        """Evaluates the run at the end of its planned duration, before any extension.
 
-        Totals, such as the RMS error, are taken here. A run that chatters at a wall is not
-        extended, see `classify_cell`.
+        Totals, such as the RMS error, are taken at this point. A run that chatters at a wall is
+        not extended, see `classify_cell`.
         """
         self._totals = self.run.totals._asdict()
         self._evaluate()
@@ -289,7 +282,7 @@ class _CellInProgress:
         return min(2.0 * self._end_s, self._longest_s)
 
     def note_extension(self, end_s: float) -> None:
-        """Judges the simulation again after it was extended, because its end was undecided.
+        """Evaluates the run again after an extension.
 
         Args:
             end_s: New end of the run, in s.
@@ -299,10 +292,10 @@ class _CellInProgress:
         self._evaluate()
 
     def judge(self) -> CellResult:
-        """Classifies the end of the simulation with the help of the stability certificate.
+        """Classifies the end of the run according to the stability certificate.
 
-        The method is called once, after the last extension, because the certificate needs the
-        roots of the control loop, which take longer than an evaluation.
+        Called once, after the last extension, because the certificate needs the roots of the
+        control loop, which are slow to compute.
         """
         judged = judge_virtual_run(self._scenario, self.run)
         decision = judged.decision
@@ -320,12 +313,11 @@ class _CellInProgress:
         A lasting motion under a user's law may be a decay that is too slow to show. The roots
         of the loop, which take longer than the measurement, are computed in this case only.
         """
-        run_trace = RunTrace(self.run.buckets, self.run.tau_x, self.run.diverged_s)
-        run_end = run_trace.classify_end(self._scenario)
+        run_end = RunEnd.of_run(self.run, self._scenario)
         self._outcome = _build_result(self.run, run_end, self._totals, self._extended)
         self._is_finished = self._outcome.is_conclusive
-        has_own_law = any(isinstance(law, ImportedLaw) for law in self._scenario.controls)
-        if self._is_finished and has_own_law and run_end.stability is Stability.NOT_STABLE:
+        has_user_law = bool(self._scenario.user_laws)
+        if self._is_finished and has_user_law and run_end.stability is Stability.NOT_STABLE:
             roots = find_run_roots(self._scenario, self.run)
             self._is_finished = roots.measure_decay_misfit(run_end) > 1.0
 
@@ -333,19 +325,18 @@ class _CellInProgress:
 def classify_cell(text: str, longest_s: float) -> CellResult:
     """Runs a cell in virtual time and classifies the end of the run.
 
-    As long as a longer run might have another class (see `CellResult.is_conclusive`), the
-    duration is doubled and the same run continues, at most up to `longest_s`. The decision of
-    the stability certificate about the whole run then gives the class, see
-    `CellClass.of_decision`.
+    While a longer run might belong to another class (see `CellResult.is_conclusive`), the
+    duration is doubled and the same run continues, up to `longest_s`. The class then follows
+    from the stability certificate's verdict on the complete run, see `CellClass.of_decision`.
 
     A run that chatters at a sampled wall, where its small motions grow, is not extended. Such
     chatter may end after minutes, once the estimates of the law have drifted, but this does not
     make the cell stable.
 
     Args:
-        text: Canonical text of the cell's scenario. Its `duration_s` is the first duration.
-        longest_s: Longest duration of the run, in s. The run is not extended if this is not
-            longer than its first duration.
+        text: Canonical text of the cell's scenario. Its `duration_s` is the initial duration.
+        longest_s: Longest duration of the run, in s. The run is not extended if this is no
+            longer than its initial duration.
     """
     cell = _CellInProgress(parse_scenario(text), longest_s)
     cell.run.advance_to(cell.duration_s)
@@ -370,12 +361,12 @@ class _JudgedCell(NamedTuple):
 
 
 def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[_JudgedCell]:
-    """Runs cells side by side, if possible, and classifies the end of each run.
+    """Runs cells side by side where possible, and classifies the end of each run.
 
-    The result of a cell is that of `classify_cell`, which explains the method.
+    The results equal those of `classify_cell`, which explains the method.
 
     Args:
-        scenarios: Scenarios of the cells. Each `duration_s` is the first duration.
+        scenarios: Scenarios of the cells. Each `duration_s` is the initial duration.
         longest_s: Longest duration of each run, in s.
 
     Yields:
@@ -492,15 +483,15 @@ numbers of the base, and lines that the base does not contain.
 
 
 def diff_lines(text: str, base: str) -> LineDiff:
-    """Encodes a string by its differences from a similar string, to save space in a file.
+    """Encodes a string as its differences from a similar string, to save space in a file.
 
-    `apply_diff` restores the text. The differences need not be minimal. Each line is looked up
-    in the base: first at the position after the previous line, and then at its first
+    `apply_diff` restores the string. The differences need not be minimal: each line is looked
+    up in the base text, first at the position after the previous match and then at its first
     occurrence.
 
     Args:
-        text: The text.
-        base: The similar text.
+        text: The string to encode.
+        base: The similar string.
     """
     base_lines = base.split("\n")
     # In reversed order the first occurrence of a line is entered last, and so it is kept.
@@ -526,11 +517,11 @@ def diff_lines(text: str, base: str) -> LineDiff:
 
 
 def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
-    """Restores a text from its differences from another text, see `diff_lines`.
+    """Restores a string from its differences from another string, see `diff_lines`.
 
     Args:
-        parts: Differences, as `diff_lines` returns them.
-        base: The base text.
+        parts: Differences, as returned by `diff_lines`.
+        base: The base string.
     """
     base_lines = base.split("\n")
     lines = list[str]()
@@ -544,12 +535,12 @@ def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
 
 
 class CellRun(msgspec.Struct, frozen=True):
-    """A finished simulation of a sweep with its result, as the sweep's journal stores it.
+    """A finished run of a sweep with its result, as stored in the sweep's journal.
 
     Attributes:
         cell: Number of the cell.
-        seed: Seed of the run.
-        random: True if the run draws random numbers. Another seed then gives another run.
+        seed: Random seed of the run.
+        random: True if the run draws random numbers, so that another seed gives another run.
         law: Control laws of the sites, without duplicates.
         sha256: Digest of the run's scenario.
         scenario: Canonical text of the run's scenario, as differences from the scenario of the
@@ -557,8 +548,8 @@ class CellRun(msgspec.Struct, frozen=True):
         outcome: Result of the run.
         metrics: Further metrics of the sweep over the scenario's duration, by key. `None` for a
             metric that the run does not have.
-        alone: Property because of which the run was computed alone, in a sweep whose runs are
-            computed side by side. Empty if it was not computed alone.
+        alone: Reason why the run was computed alone, in a sweep whose runs are computed side by
+            side. Empty if it was not computed alone.
     """
 
     cell: int

@@ -1,14 +1,14 @@
 """Plans a sweep: the runs of one scenario over a grid of parameters, control laws and seeds.
 
-For example, the text "link.delay_ms=0:400:50" makes the network delay an axis of the grid, with
-the values 0 to 400 ms. One combination of the values of all axes and of a control law is called
-a cell. Each cell is run once per random seed. This module combines the axes, laws and seeds
-with the scenario, and checks the result before anything runs. `SweepAxis` parses an axis.
+For example, the string "link.delay_ms=0:400:50" makes the network delay an axis of the grid,
+with values from 0 to 400 ms. A cell combines one value of every axis with a control law, and is
+run once per random seed. This module combines the axes, laws and seeds with the scenario, and
+checks the result before anything runs. `SweepAxis` parses the axes.
 
 Invariant:
     - A plan that cannot run is rejected before the first run.
-    - Cells are numbered row by row. A cell is computed from the plan and its number, so a large
-      grid need not be stored.
+    - Cells are numbered row by row. Any cell can be computed from the plan and its number, so a
+      large grid need not be stored.
 """
 
 import math
@@ -44,15 +44,15 @@ _CHECKED_VALUES = 32
 
 
 class SweepCell(NamedTuple):
-    """One combination of parameter values and a control law, as a sweep simulates it.
+    """One cell of a sweep: a combination of parameter values and a control law.
 
     Attributes:
         number: Number of the cell, counted row by row from 0. The law changes slowest, and the
             value of the last axis changes fastest.
         law: Control law of the cell. Empty if the sweep does not vary the law.
-        values: Value of the cell on each axis: a float if it is a number, otherwise a text.
-        overrides: Overrides KEY=VALUE that turn the scenario of the sweep into the scenario of
-            the cell.
+        values: Value of the cell on each axis: a float if it is a number, a string otherwise.
+        overrides: Overrides KEY=VALUE that turn the scenario of the sweep into that of the
+            cell.
     """
 
     number: int
@@ -64,9 +64,8 @@ class SweepCell(NamedTuple):
 class SweepPlan(NamedTuple):
     """Everything that determines a sweep: scenario, axes, laws and seeds.
 
-    `plan_sweep` creates this object and checks it. A sweep runs a scenario for every
-    combination of the values of its axes and of a control law, called a cell, with one or
-    several seeds.
+    `plan_sweep` creates and checks this object. A cell combines one value of every axis with a
+    control law, and is run with one or more seeds.
 
     Attributes:
         written: Scenario as its author wrote it, without overrides and default values.
@@ -74,14 +73,13 @@ class SweepPlan(NamedTuple):
         base: Scenario with `overrides`, with all default values filled in.
         axes: Swept axes. The last one changes fastest from cell to cell.
         laws: For each swept control law, the overrides that select it. The law changes slowest.
-            If there are no swept laws, all cells have the laws of the scenario.
-        seeds: Seeds with which each cell is run. A cell in which nothing is random is run with
-            the first seed only, since all others would give the same run.
-        longest_s: Longest duration to which a run is extended while its result is undecided, in
-            s.
-        judge: Method by which a run is judged, a name of `JUDGES`.
-        metrics: Keys of further metrics from `docs/reference/metrics.md` that are measured in
-            each run.
+            If no laws are swept, all cells have the laws of the scenario.
+        seeds: Random seeds for each cell. A cell in which nothing is random is run with the
+            first seed only, since all others would give the same run.
+        longest_s: Longest duration to which a run is extended while it is undecided, in s.
+        judge: How runs are judged, a name in `JUDGES`.
+        metrics: Keys of further metrics from `docs/reference/metrics.md` to measure in each
+            run.
         refine: Number of times that the boxes along the stability edge are halved, see
             `edge_refinement`. 0 runs all cells.
     """
@@ -99,18 +97,18 @@ class SweepPlan(NamedTuple):
 
     @property
     def default_longest_s(self) -> float:
-        """Default of the longest duration to which an undecided run is extended, in s.
+        """Default for the longest duration to which an undecided run is extended, in s.
 
-        It is the duration of the scenario times `MAX_EXTENSION`, but at most `MAX_SCENARIO_S`.
-        If cells are judged by how fast small disturbances grow, runs are never extended, so it
-        is the duration of the scenario.
+        This is the duration of the scenario times `MAX_EXTENSION`, but at most
+        `MAX_SCENARIO_S`. If cells are judged by how fast small disturbances grow, runs are
+        never extended, and it is the duration of the scenario.
         """
         extension = MAX_EXTENSION if self.judge == "verdict" else 1.0
         return min(MAX_SCENARIO_S, extension * self.base.duration_s)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Size of the grid: the number of laws, then the number of values of each axis.
+        """Size of the grid: the number of laws, then the number of values on each axis.
 
         The number of laws is 1 if the sweep does not vary the law.
         """
@@ -118,7 +116,7 @@ class SweepPlan(NamedTuple):
 
     @property
     def cells(self) -> int:
-        """Number of combinations of all swept parameter values and control laws."""
+        """Number of cells in the grid."""
         return math.prod(self.shape)
 
     @property
@@ -137,8 +135,8 @@ class SweepPlan(NamedTuple):
     def list_checked_indices(self, dimension: int) -> list[int]:
         """Returns the indices of the values that are checked before a sweep runs.
 
-        At most `_CHECKED_VALUES` indices, including the first and the last one, are spread
-        evenly over the values. A grid may be too large to check every cell.
+        A large grid cannot be checked completely. At most `_CHECKED_VALUES` indices, including
+        the first and the last one, are spread evenly over the values of the dimension.
 
         Args:
             dimension: Dimension of the grid, see `shape`.
@@ -149,14 +147,13 @@ class SweepPlan(NamedTuple):
         return [index * (count - 1) // intervals for index in range(checked)]
 
     def cell(self, number: int) -> SweepCell:
-        """Returns a combination of parameter values and control law by its number.
+        """Computes a cell from its number.
 
         Args:
-            number: Number of the combination, from 0, counted row by row in the grid of the
-                sweep.
+            number: Number of the cell, counted row by row from 0.
 
         Raises:
-            UsageError: The grid has no combination with this number.
+            UsageError: The grid has no cell with this number.
         """
         if not 0 <= number < self.cells:
             raise UsageError(
@@ -184,7 +181,7 @@ class SweepPlan(NamedTuple):
         return SweepCell(number, law, tuple(values), tuple(overrides))
 
     def scenario(self, *more: str) -> Scenario:
-        """Loads the scenario of the sweep with further settings, such as a swept delay.
+        """Loads the scenario of the sweep with further overrides, such as a swept delay.
 
         Args:
             more: Further overrides KEY=VALUE.
@@ -195,12 +192,12 @@ class SweepPlan(NamedTuple):
         return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
-        """Returns the plan of a parameter sweep as plain values, which a JSON file stores.
+        """Converts the plan to plain values for a JSON file.
 
-        `from_facts` restores the plan from them. The keys "judge" (how runs are judged),
-        "metrics" (which further quantities are measured) and "refine" (how often the edge of
-        stability is refined) are left out if they have their defaults, so that plans of older
-        versions give the same file.
+        `from_facts` restores the plan. The keys "judge" (how runs are judged), "metrics" (which
+        further metrics are measured) and "refine" (how often the stability edge is refined) are
+        omitted if they have their defaults. Plans written by older versions therefore give the
+        same file.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,
@@ -226,8 +223,7 @@ class SweepPlan(NamedTuple):
     def from_facts(cls, facts: dict[str, Any]) -> "SweepPlan":
         """Restores a plan from the plain values that `SweepPlan.facts` returned.
 
-        The scenario is parsed from its stored text. Files that the scenario names are read
-        again.
+        The scenario is parsed from its stored text. Files named in the scenario are read again.
 
         Args:
             facts: The plain values, as read from the JSON file.
@@ -258,7 +254,7 @@ class SweepPlan(NamedTuple):
         )
 
     def build_command(self, *more: str) -> str:
-        """Returns the shell command that repeats a sweep. Default options are left out.
+        """Returns the shell command that repeats the sweep, leaving out default options.
 
         Args:
             more: Further arguments of the command.
@@ -290,10 +286,10 @@ class SweepPlan(NamedTuple):
         return format_command("sweep", self.written.label, *arguments, *more)
 
     def list_totals(self) -> list[str]:
-        """Lists the measured quantities whose means over the seeds a sweep computes.
+        """Lists the quantities whose means over the seeds the sweep computes.
 
-        These are the totals of every run, such as the RMS error, and the metrics that the sweep
-        requested.
+        These are the totals of every run, such as the RMS error, and the metrics requested for
+        this sweep.
         """
         keys = (*sweep_cell.TOTAL_KEYS, *self.metrics)
         return list(dict.fromkeys(keys))
@@ -301,9 +297,9 @@ class SweepPlan(NamedTuple):
     def reproduction_duration_s(self, outcome: sweep_cell.CellResult) -> float:
         """Returns the duration with which a run must be started to reproduce its row, in s.
 
-        A run that diverged, which means that an arm left its limits, ended before its planned
-        duration. It is started with the planned duration, and will end early again. Every
-        extension of an undecided run doubles the planned duration.
+        A run that diverged ended before its planned duration. It is started with the planned
+        duration and will end early again. Every extension of an undecided run doubles the
+        planned duration.
 
         Args:
             outcome: Result of the run.
@@ -317,12 +313,11 @@ class SweepPlan(NamedTuple):
     def build_sim_command(
         self, overrides: Sequence[str], seed: int, duration_s: float, log: str
     ) -> str:
-        """Returns the shell command that repeats one simulation of a sweep and records a log.
+        """Returns the shell command that repeats one run of the sweep and records a log.
 
         Args:
-            overrides: Overrides KEY=VALUE that turn the swept scenario into the scenario of the
-                run.
-            seed: Seed of the run.
+            overrides: Overrides KEY=VALUE that turn the swept scenario into that of the run.
+            seed: Random seed of the run.
             duration_s: Duration of the run, in s.
             log: Name of the log.
         """
@@ -338,7 +333,7 @@ class SweepPlan(NamedTuple):
         return format_command("sim", source, *set_arguments, *run_arguments, "-o", log)
 
     def describe(self) -> list[str]:
-        """Returns lines that state the number of simulations and the values of a sweep."""
+        """Returns lines that state the number of runs and the swept values."""
         axis_sizes = [str(len(axis.texts)) for axis in self.axes]
         sizes = " x ".join(axis_sizes) or "1"
         laws = f" x laws {', '.join(self.laws)}" if self.laws else ""
@@ -372,10 +367,10 @@ class SweepPlan(NamedTuple):
         return [*lines, f"  {first_s:g} s each{extended}{twins}"]
 
     def list_axis_columns(self) -> dict[str, type]:
-        """Returns the columns of a CSV table that identify a combination of swept parameters.
+        """Returns the columns of the CSV table that identify a cell, with their types.
 
-        The columns are the number of the combination, the value of each axis, and the control
-        law. Each column has the type with which the table is read again.
+        These columns are the number of the cell, the value on each axis, and the control law.
+        The types are used to parse the table.
         """
         column_types: dict[str, type] = {"cell": int}
         for axis in self.axes:
@@ -396,13 +391,13 @@ def plan_sweep(
     metrics: Sequence[str] = (),
     refine: int = 0,
 ) -> SweepPlan:
-    """Plans a sweep, which runs a scenario with many parameters, and checks that it can run.
+    """Plans a sweep and checks that it can run.
 
-    Each law in `laws` is used at all sites, the processes that run one arm each. If all sites
-    use the law in the scenario already, it keeps the gains of the scenario. Otherwise it gets
-    its default gains. Overrides of gains apply in both cases.
+    Each law in `laws` is used at all sites. If all sites already use this law in the scenario,
+    the gains of the scenario are kept. Otherwise the law gets its default gains. Gain overrides
+    apply in both cases.
 
-    The arguments are explained in `trilat_net.sweep`. Overrides are texts KEY=VALUE.
+    The arguments are explained in `trilat_net.sweep`. Overrides are strings KEY=VALUE.
 
     Returns:
         The checked plan.

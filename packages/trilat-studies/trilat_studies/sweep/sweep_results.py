@@ -1,18 +1,17 @@
-"""Stores and summarises the results of a sweep over a grid of parameters.
+"""Reads and summarises the results of a sweep over a grid of parameters.
 
-A sweep runs a scenario at every point of the grid. One point of the grid, called a cell, is run
-once per random seed. This module reads the table of a finished sweep, which has one row per
-run. It combines the runs of a cell, composes a summary, and finds the command that repeats a
-run.
+The table of a finished sweep has one row per run, and each cell (a point of the grid) has one
+run per random seed. This module reads the table, combines the runs of a cell, composes a
+summary, and finds the command that repeats a run.
 
 Invariant:
-    - The bytes of the result files depend only on the runs, and not on the time or the number
-      of worker processes.
+    - The bytes of the result files depend only on the runs, not on the time of day or the
+      number of worker processes.
     - Reading the CSV table restores all numbers bit for bit.
     - Running the scenario of a row again reproduces the row.
-    - Every printed command reproduces the run, with the same hash of the scenario as its row.
-      If the source of the scenario has changed since the sweep, the command names a file to
-      which the scenario of the row was written.
+    - Every printed command reproduces the run, with the same scenario hash as its row. If the
+      source of the scenario has changed since the sweep, the command names a file to which the
+      scenario of the row was written.
 """
 
 import json
@@ -52,46 +51,37 @@ PLAN_FILE = "plan.json"
 class SweepResults(Result):
     """Results of a finished sweep, as a table with one row per run.
 
-    A run belongs to a cell, which is a combination of the values of all axes and of a control
-    law. The runs of a cell differ in their seeds.
+    The runs of a cell differ in their seeds.
 
     Attributes:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         rows: One row per run, ordered by cell and then by seed. The rows of a large sweep stay
-            in the file of the table, and are read when they are needed.
+            on disk and are read on demand.
     """
 
     plan: SweepPlan
     rows: Sequence[ResultRow]
 
     def blocks(self) -> Iterator[str]:
-        """Yields the lines of text that `trilat sweep` prints about a parameter sweep.
-
-        The first lines describe the sweep, the following lines summarise its results.
-        """
+        """Yields the lines that `trilat sweep` prints: the plan and a summary of results."""
         yield from self.plan.describe()
         yield from self.summarize()
 
     def to_rows(self) -> Sequence[ResultRow]:
-        """Returns the table of all runs, one row per run, ordered by cell and then by seed.
-
-        A cell is a combination of the values of all axes.
-        """
+        """Returns the table of all runs, one row per run, ordered by cell and then by seed."""
         return self.rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results of a parameter sweep to plain values, for JSON.
-
-        `trilat sweep --json` prints them.
+        """Converts the results to the plain values that `trilat sweep --json` prints.
 
         Returns:
-            The facts of the plan, and a row per run with the columns of the CSV table.
+            The facts of the plan, and one row per run with the columns of the CSV table.
         """
         runs = [dict(row) for row in self.rows]
         return {"plan": self.plan.facts(), "runs": runs}
 
     def of_cell(self, number: int) -> list[ResultRow]:
-        """Returns the results of one combination of swept parameters, a row per random seed.
+        """Returns the results of one cell, with one row per random seed.
 
         Args:
             number: Number of the cell.
@@ -105,10 +95,10 @@ class SweepResults(Result):
         return [row for row in self.rows if row["cell"] == number]
 
     def outcome(self, row: ResultRow) -> CellResult:
-        """Converts the table row of a simulation to an object with named fields.
+        """Converts the table row of a run to an object with named fields.
 
-        Fields that are missing from the row, because an older version wrote it, have the
-        default values of `CellResult`.
+        Fields that are missing from the row, because an older version wrote it, get the default
+        values of `CellResult`.
 
         Args:
             row: Row of the run.
@@ -116,10 +106,7 @@ class SweepResults(Result):
         return msgspec.convert(row, CellResult)
 
     def iterate_grid_points(self) -> "Iterator[_GridPoint]":
-        """Yields the summary of each combination of swept parameters.
-
-        `list_grid_points` returns the same summaries as a list.
-        """
+        """Yields the summary of each grid point, as in `list_grid_points`."""
         totals = self.plan.list_totals()
         groups = groupby(self.rows, key=lambda row: (row["cell"], row["law"]))
         for (cell, law), group in groups:
@@ -142,12 +129,12 @@ class SweepResults(Result):
             )
 
     def list_grid_points(self) -> "list[_GridPoint]":
-        """Summarises the simulations of a sweep that differ only in their random seeds.
+        """Summarises the runs at each grid point, which differ only in their random seeds.
 
         Returns:
-            A summary for each combination of swept parameters and control law (a grid point).
-            It has the number of runs with each result, and the means of the measured totals.
-            The order is the order in which the combinations first occur in the results.
+            One summary per combination of swept parameters and control law (grid point), with
+            the number of runs in each class and the means of the measured totals. Summaries are
+            listed in the order in which their grid points first occur in the results.
         """
         return list(self.iterate_grid_points())
 
@@ -155,7 +142,7 @@ class SweepResults(Result):
         """Returns the command that repeats the run of a row.
 
         If the source of the scenario has changed since the sweep, the command in the row would
-        run something else. In this case the scenario of the row is written to a file, and the
+        run something else. In that case, the scenario of the row is written to a file, and the
         command runs that file.
 
         Args:
@@ -163,8 +150,8 @@ class SweepResults(Result):
             folder: Folder in which the file is written, if necessary.
 
         Returns:
-            The command, and a note on a changed scenario. The note is empty if the scenario has
-            not changed.
+            The command, and a note that the scenario has changed. The note is empty if it has
+            not.
         """
         plan = self.plan
         source = plan.written.label
@@ -190,14 +177,14 @@ class SweepResults(Result):
         return command, note
 
     def encode_grid_points(self) -> Iterator[str]:
-        """Encodes the grid points as a CSV table, with one line per point.
+        """Encodes the grid points as CSV text, with one line per point.
 
-        A line contains the number of the cell, its axis values and law, the number of runs of
+        A line contains the number of the cell, its axis values and law, the number of runs in
         each class, the fraction of stable runs with its 95 % interval, and the means of the
         measured quantities with their intervals.
 
         Yields:
-            The header, and the text of each line.
+            The header line, then one line per grid point.
         """
         plan = self.plan
         column_types = plan.list_axis_columns()
@@ -209,7 +196,7 @@ class SweepResults(Result):
             column_types |= {f"{key}_{field}": float for field in MeanInterval._fields}
 
         def list_values(point: _GridPoint) -> dict[str, Any]:
-            """Returns the values of one line of the CSV table, by column, of a grid point."""
+            """Returns the line of a grid point as a mapping from column name to value."""
             decided = point.decided
             stable_share = point.stable / decided if decided else None
             # The values must be in the order of the columns above.
@@ -227,7 +214,7 @@ class SweepResults(Result):
 
         The lines state how many runs each class has, how many runs were extended, the ranges of
         the measured quantities, the growth exponents, and the differences between seeds. Lines
-        about quantities that the sweep does not have are left out.
+        that do not apply to the sweep are omitted.
         """
         plan = self.plan
         tally = _tally_rows(self)
@@ -269,7 +256,7 @@ class SweepResults(Result):
 
 
 def read_results(path: Path) -> SweepResults:
-    """Reads the results of a finished parameter sweep from its folder.
+    """Reads the results of a finished sweep from its folder.
 
     Args:
         path: Folder of the sweep, or its CSV table.
@@ -322,16 +309,13 @@ class _GridPoint(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """Number of simulations of a combination that were judged stable or not stable.
-
-        Undecided simulations are left out.
-        """
+        """Number of runs that were judged stable or not stable, excluding undecided ones."""
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable is not None)
 
     @property
     def stable(self) -> int:
-        """Number of simulations of a combination that were judged stable."""
+        """Number of runs that were judged stable."""
         classes = zip(self.counts, RUN_CLASSES, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
@@ -346,10 +330,10 @@ class _GridPoint(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the probability that a decided simulation is stable.
+        """95 % confidence interval of the probability that a decided run is stable.
 
-        The method is Wilson's. Even if 10 of 10 runs are stable, the lower end is below 1,
-        because other seeds might give another result.
+        Computed with Wilson's method. Even if 10 of 10 runs are stable, the lower end is below
+        1, because other seeds might give another result.
         """
         return wilson_interval(self.stable, self.decided)
 
@@ -401,9 +385,9 @@ class _ValueRange:
         self.high = -math.inf
 
     def add(self, value: float | None) -> None:
-        """Updates the smallest and the largest value with the value of one simulation.
+        """Updates the smallest and the largest value with the value of one run.
 
-        `None`, for a simulation that lacks the quantity, changes nothing.
+        `None`, the value of a run that lacks the quantity, is ignored.
         """
         if value is None:
             return

@@ -1,15 +1,14 @@
 """Runs a sweep and stores its results in a folder.
 
-A sweep runs one scenario on a grid of parameters. A cell is one combination of these
-parameters; it is run once per seed of the random numbers. The folder of a sweep contains the
-plan, a journal to which every finished run is appended, and finally the results. A sweep that
-was interrupted continues after the last finished run.
+A sweep runs one scenario over a grid of parameters, and each cell of the grid is run once per
+random seed. The folder contains the plan, a journal to which every finished run is appended,
+and finally the results. An interrupted sweep continues after the last finished run.
 
 Invariant:
-    - A folder belongs to one sweep with one kind of arithmetic. Any other sweep is rejected,
-      because its results might differ.
-    - The results depend only on the plan, and not on the number of processes, on the order of
-      the runs, or on interruptions.
+    - A folder belongs to one sweep and one kind of floating-point arithmetic. Any other
+      combination is rejected, because its results might differ.
+    - The results depend only on the plan, not on the number of processes, the order of the runs
+      or interruptions.
     - A run in the journal is not repeated.
 """
 
@@ -25,7 +24,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunTrace, TwinGrowth
+from trilat_net.analysis import SETTLED_ERROR_RAD, LogMetrics, RunEnd, TwinGrowth
 from trilat_net.errors import (
     CodeFailed,
     CodeWithheld,
@@ -38,7 +37,6 @@ from trilat_net.errors import (
 from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
-from trilat_net.own_code import list_imported_code
 from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
@@ -46,9 +44,7 @@ from trilat_net.work import (
     StudyFolder,
     WorkerPool,
     Workers,
-    build_resume_hint,
     ignore_progress,
-    open_worker_pool,
 )
 from trilat_net.workers import count_cores
 
@@ -98,7 +94,7 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
         facts: The plan as plain values, with the arithmetic and the versions of the program.
     """
     plan_digest = hashlib.sha256(_encode_plan(facts).encode()).hexdigest()
-    remedy = build_resume_hint("sweep", "--resume", str(path))
+    remedy = RunJournal.build_resume_hint("sweep", "--resume", str(path))
 
     def open_journal() -> RunJournal[CellRun]:
         return RunJournal(path / JOURNAL_FILE, plan_digest, CellRun, remedy)
@@ -107,10 +103,10 @@ def _build_folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> Swee
 
 
 def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
-    """Creates the folder of a sweep, or opens a folder in which some runs are finished.
+    """Creates the folder of a sweep, or reopens one that already has finished runs.
 
     Args:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         path: Path of the folder. If `None`, a new folder with a default name is created.
 
     Raises:
@@ -126,7 +122,7 @@ def prepare_sweep_folder(plan: SweepPlan, path: Path | None) -> SweepFolder:
 
 
 def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFolder:
-    """Opens the folder of a parameter sweep that was started earlier.
+    """Opens the folder of a sweep that was started earlier.
 
     Args:
         path: Path of the folder.
@@ -238,7 +234,7 @@ _RESUME_HINT = "; finished runs are kept: continue with --resume"
 
 
 class DurationEstimate(NamedTuple):
-    """Estimated duration of the remaining simulations of a sweep.
+    """Estimated duration of the remaining runs of a sweep.
 
     Attributes:
         runs: Largest possible number of remaining runs.
@@ -254,12 +250,12 @@ class DurationEstimate(NamedTuple):
     def of_sweep(
         cls, plan: SweepPlan, done: Iterable[tuple[int, int]] = (), jobs: int | None = None
     ) -> "DurationEstimate":
-        """Estimates the duration of a sweep from a few simulations spread over its parameters.
+        """Estimates the duration of a sweep from a few runs spread over its parameters.
 
         Args:
-            plan: The sweep: its scenario, axes, control laws and seeds.
+            plan: The sweep.
             done: Finished runs, as pairs of cell number and seed. These runs are not repeated.
-            jobs: Number of worker processes of the sweep. If `None`, all cores are used.
+            jobs: Number of worker processes of the sweep. If `None`, one per core.
         """
         finished_runs = set(done)
         refinement = EdgeRefinement(plan) if plan.refine else None
@@ -306,11 +302,11 @@ class DurationEstimate(NamedTuple):
         return cls(runs, seconds, entries)
 
     def refuse_oversized_sweep(self, plan: SweepPlan, jobs: int | None = None) -> None:
-        """Rejects a sweep of more than `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
+        """Raises UsageError if a sweep exceeds `MAX_RUNS` runs or `MAX_SWEEP_S` seconds.
 
         Args:
-            plan: The sweep: its scenario, axes, control laws and seeds.
-            jobs: Number of worker processes. If `None`, all cores are used.
+            plan: The sweep.
+            jobs: Number of worker processes. If `None`, one per core.
 
         Raises:
             UsageError: The sweep is too large. The message states its size and duration.
@@ -328,9 +324,9 @@ class DurationEstimate(NamedTuple):
 
 
 class FinishedSweep(NamedTuple):
-    """Results of a finished sweep, with the time and the number of runs that it took.
+    """Results of a finished sweep, with the number of runs and the time that they took.
 
-    The numbers of runs and times count from the last start or resumption of the sweep.
+    All counts and times start at the last start or resumption of the sweep.
 
     Attributes:
         results: Results of all runs of the sweep.
@@ -339,8 +335,8 @@ class FinishedSweep(NamedTuple):
         simulated_s: Total simulated time of these runs, in s.
         wall_s: Real time that these runs took, in s.
         jobs: Number of worker processes.
-        alone: Reasons why runs were not computed side by side with others, with the number of
-            these runs. Runs of a sweep that computes all runs one by one are not counted.
+        alone: Maps each reason why runs were not computed side by side with others to the
+            number of these runs. Not used in a sweep that computes all runs one at a time.
     """
 
     results: SweepResults
@@ -352,7 +348,7 @@ class FinishedSweep(NamedTuple):
     alone: Mapping[str, int] = {}
 
     def describe_speed(self) -> str:
-        """Returns a sentence about the computing speed of the runs in relation to real time."""
+        """Returns a sentence on how fast the runs were computed, relative to real time."""
         processes = count_nouns(self.jobs, "process")
         wall_time = format_wall_time(self.wall_s)
         ratio = self.simulated_s / (self.wall_s * self.jobs) if self.wall_s else math.nan
@@ -366,9 +362,9 @@ class CellItem(NamedTuple):
     The object is pickled and sent to the process.
 
     Attributes:
-        plan: The sweep: its scenario, axes, control laws and seeds.
+        plan: The sweep.
         cell: The values of all axes and the control law of the run.
-        seed: Seed of the run.
+        seed: Random seed of the run.
     """
 
     plan: SweepPlan
@@ -381,7 +377,7 @@ class CellItem(NamedTuple):
     def run(self) -> CellRun:
         """Executes one run of a sweep.
 
-        The method depends only on this object, so any worker process can call it.
+        The result depends only on this object, so any worker process can compute it.
 
         Returns:
             The finished run with its result, ready for the journal of the sweep.
@@ -490,7 +486,7 @@ def _measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
-    end = RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+    end = RunEnd.of_run(run, scenario)
     twins = TwinGrowth.of_scenario(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)
@@ -583,15 +579,15 @@ def run_sweep(
     known: Iterable[CellRun] = (),
     on: Workers = None,
 ) -> FinishedSweep:
-    """Executes the remaining simulations of a parameter sweep, and writes all results.
+    """Executes the remaining runs of a sweep and writes all results.
 
     Args:
         folder: Folder of the sweep. The runs in its journal are not repeated.
-        jobs: Number of worker processes. If `None`, all cores are used.
-        progress: Function that is called with the number of finished runs and the number of
-            runs that are known to be necessary.
+        jobs: Number of worker processes. If `None`, one per core.
+        progress: Called with the number of finished runs and the number of runs known to be
+            necessary.
         known: Finished runs, for example from an estimate. They are added to the journal and
-            are not repeated.
+            not repeated.
         on: Workers to use instead of processes on this computer.
 
     Raises:
@@ -609,9 +605,9 @@ def run_sweep(
                 tally.note(entry)
         started_ns = clock.monotonic_ns()
         left = plan.cells * len(plan.seeds) - len(journal.done)
-        laws = list_imported_code([plan.base])
+        laws = plan.base.imported_code
         workers = on if left else None  # no cluster is needed if nothing is left to run
-        with open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
+        with WorkerPool.open(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
             count = pool.workers
             _SweepWork(plan, journal, pool, progress, tally).execute()
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
@@ -644,7 +640,7 @@ class _NewRuns:
         self.simulated_s = 0.0
 
     def note(self, run: CellRun) -> None:
-        """Counts a finished simulation, for the totals at the end of a sweep."""
+        """Counts a finished run for the totals at the end of the sweep."""
         self.runs += 1
         self.simulated_s += run.outcome.ran_s
 
@@ -663,10 +659,9 @@ def _write_table(folder: SweepFolder, done: Mapping[tuple[int, int], CellRun]) -
     reasons: Counter[str] = Counter()
 
     def iterate_rows() -> Iterator[ResultRow]:
-        """Yields the result rows of all parameter combinations for the CSV table.
+        """Yields the result rows of all cells for the CSV table.
 
-        The function also counts the reasons why some simulations could not run side by side
-        with others.
+        Also counts the reasons why some runs could not be computed side by side with others.
         """
         for runs in table.iterate_cells(done):
             reasons.update(run.alone for run in runs if run.alone)
@@ -719,11 +714,10 @@ class _SweepWork:
         self._tally = tally
 
     def execute(self) -> None:
-        """Simulates all cells or, in a refined sweep, the cells near a stability edge.
+        """Runs all cells or, in a refined sweep, the cells near a stability edge.
 
-        A refined sweep proceeds in rounds. The runs of a round show on which side of the
-        stability edge their combinations (cells) lie, and this determines the cells of the next
-        round.
+        A refined sweep proceeds in rounds. The runs of a round show on which side of the edge
+        their cells lie, which determines the cells of the next round.
         """
         plan = self._plan
         if not plan.refine:

@@ -1,13 +1,13 @@
-"""Compares control laws fairly, at gains that the same procedure has tuned.
+"""Compares control laws fairly, with gains tuned by the same procedure.
 
-The gains of each law are tuned with the same number of attempts. Each law is then shown as a
-Pareto front of error against effort: the gains for which no other gains of the law are better
-in both. docs/reference/tuning-procedure.md has the procedure, the formulas and the search
+The gains of each law are tuned with the same number of attempts. Each law is then presented as
+a Pareto front of error against effort: the gains for which no other gains of the law are better
+in both. docs/reference/tuning-procedure.md describes the procedure, the formulas and the search
 ranges.
 
 Invariant:
-    - Every law gets the same number of candidates, the same torque limit, duration, seeds,
-      information about gravity, and classification of its runs.
+    - Every law gets the same number of candidates, torque limit, duration, seeds and
+      information about gravity, and its runs are classified in the same way.
     - The error between an arm and those that it follows does not rank laws by itself, because
       it is zero for arms that hang down together.
 """

@@ -1,8 +1,8 @@
-"""Runs and scores a candidate of a tuning: a control law with chosen gains.
+"""Runs and scores one candidate of a tuning: a control law with chosen gains.
 
-The score contains the error, the effort of the motors, and a class that states how well the
-arms behaved. The error is the distance of the arms from the consensus pose q*, on which the
-arms would agree if gravity did not act on them:
+The score contains the error, the motor effort, and a class that states how well the arms
+behaved. The error is the distance of the arms from the consensus pose q*, on which the arms
+would agree in the absence of gravity:
 
 - Before any operator acts, q* = sum_i beta_i q_i(0), where q_i(0) are the joint angles of arm i
   at the start, in rad.
@@ -11,14 +11,13 @@ arms would agree if gravity did not act on them:
   m/rad.
 - After the operators have released the arms, q* keeps its value.
 
-Here beta_i is the influence of arm i. The dominance factors alpha_ij, the weights with which
-arm i follows arm j, determine it by beta' alpha = beta' with sum_i beta_i = 1.
+Here beta_i is the influence of arm i. It is determined from the dominance factors alpha_ij, the
+weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
 
-A law may promise a motion other than agreement at q*, see `LawSettings.target_motion`. In this
-case, the error contains the distance of each arm from the promised motion instead of the
-distance between the arms, and a run is judged by the end of the promised motion. The distance
-of the mean from q* stays part of the error, so that arms that do not move at all have a large
-error.
+A law may promise a motion other than agreement at q*, see `LawSettings.target_motion`. The
+distance of each arm from the promised motion then replaces the distance between the arms in the
+error, and a run is judged by the end of the promised motion. The distance of the mean from q*
+remains part of the error, so that arms that do not move at all have a large error.
 
 Walls, and operators who push without a target, do not determine a final pose. A scenario that
 contains them is also run without them, to find the pose at which the arms would come to rest.
@@ -43,15 +42,14 @@ import numpy as np
 
 from trilat_net.analysis import (
     SETTLED_ERROR_RAD,
-    DominancePlan,
+    DominanceHistory,
     EndBehaviour,
     RunEnd,
     SourceRows,
     Stability,
     build_arm_rows,
-    find_hanging_sites,
 )
-from trilat_net.core import Array, DominanceMatrix
+from trilat_net.core import Array, DominanceMatrix, TorqueKind
 from trilat_net.errors import CodeFailed, ScenarioError
 from trilat_net.laws import LawSettings, TuningRun
 from trilat_net.log import Log
@@ -59,9 +57,7 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import (
     END_WINDOW_S,
     ExperimentText,
-    JointSpring,
     Scenario,
-    Wall,
     parse_scenario,
 )
 from trilat_net.work import MeanInterval
@@ -77,10 +73,10 @@ _POSE_SAMPLES_HZ = 100.0
 
 
 def check_comparable(scenario: Scenario) -> None:
-    """Rejects a scenario in which control laws cannot be compared fairly.
+    """Raises ScenarioError if control laws cannot be compared fairly in a scenario.
 
-    The error of a law is measured from the pose on which the arms should agree. Therefore the
-    scenario must determine a pose that all arms could reach.
+    The error of a law is measured from the pose on which the arms should agree, so the scenario
+    must determine a pose that all arms can reach.
 
     Args:
         scenario: The scenario in which laws are to be compared.
@@ -131,21 +127,21 @@ def build_twin(scenario: Scenario) -> Scenario | None:
     """Derives the scenario that shows at which pose the arms would come to rest undisturbed.
 
     Walls, and operators who push without a target pose, keep the arms away from that pose. The
-    derived scenario, the twin of the candidate, does not contain them. The pose at the end of
-    its run depends only on the dominance factors (the weights with which the arms follow one
-    another) and on the targets.
+    derived scenario, called the twin, excludes them. The pose at the end of its run depends
+    only on the dominance factors and on the targets.
 
     Args:
         scenario: Scenario of the candidate.
 
     Returns:
-        The twin. `None` if no twin is needed, because the scenario has no such walls and
-        operators.
+        The twin, or `None` if the scenario has no such walls and operators and needs no twin.
     """
     sites = {}
     for name, spec in scenario.sites.items():
-        hands = tuple(hand for hand in spec.hands if isinstance(hand, JointSpring))
-        environment = tuple(part for part in spec.environment if not isinstance(part, Wall))
+        hands = tuple(hand for hand in spec.hands if hand.actor.kind is TorqueKind.HAND)
+        environment = tuple(
+            part for part in spec.environment if part.actor.kind is not TorqueKind.WALL
+        )
         sites[name] = msgspec.structs.replace(spec, hands=hands, environment=environment)
     if sites == scenario.sites:
         return None
@@ -153,16 +149,15 @@ def build_twin(scenario: Scenario) -> Scenario | None:
 
 
 def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
-    """Computes q*, the pose on which the arms would agree if gravity did not act on them.
+    """Computes q*, the pose on which the arms would agree in the absence of gravity.
 
-    While operators pull the arms like springs towards target poses, q* is the average of the
-    targets for each joint. It is weighted with the stiffness of the operators and the influence
-    of their arms. Before any operator pulls, q* is the weighted average of the start poses.
-    After the last operator has released its arm, q* keeps its value.
+    While operators pull the arms like springs towards target poses, each joint of q* is an
+    average of the targets, weighted with the stiffness of the operators and the influence of
+    their arms. Before any operator pulls, q* is the weighted average of the start poses. After
+    the last operator has released its arm, q* keeps its value.
 
     Args:
-        scenario: Scenario with the arms, their operators and the dominance factors, which are
-            the weights with which the arms follow one another.
+        scenario: Scenario with the arms, their operators and the dominance factors.
         t_s: Times, shape (K,), in s.
 
     Returns:
@@ -227,13 +222,14 @@ def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
     """
     for name, spec in scenario.sites.items():
         for hand in spec.hands:
-            if not isinstance(hand, JointSpring):
+            source = hand.actor
+            if source.kind is not TorqueKind.HAND:
                 continue
-            acts = (t_s >= hand.start_s) & (t_s < hand.end_s)
-            target_rad, _ = SourceRows(hand.actor).find_target_motion(t_s)
+            acts = (t_s >= source.start_s) & (t_s < source.end_s)
+            target_rad, _ = SourceRows(source).find_target_motion(t_s)
             yield _SpringHistory(
                 site=name,
-                stiffness_nm_rad=np.array(hand.stiffness_nm_rad),
+                stiffness_nm_rad=np.array(source.K),
                 acts=acts[:, np.newaxis].astype(np.float64),
                 target_rad=target_rad,
             )
@@ -248,7 +244,7 @@ TOGETHER_RAD = 0.02
 
 
 class CandidateClass(StrEnum):
-    """Classes of the arms' behaviour with a control law and chosen gains, from worst to best.
+    """How the arms behave with a control law and chosen gains, from worst to best.
 
     If several classes apply to a run, the first one counts. `CLASS_MEANINGS` explains each
     class. JSON files contain the values.
@@ -265,7 +261,7 @@ class CandidateClass(StrEnum):
     def word(self) -> str:
         """Word for the end of a candidate's run in printed text, such as "stable".
 
-        Where possible, it is the word that the judgement of a single run uses.
+        Where possible, this is the word used in the verdict on a single run.
         """
         if self is CandidateClass.OSCILLATED:
             return Stability.NOT_STABLE.value
@@ -277,7 +273,7 @@ class CandidateClass(StrEnum):
     def classify(
         cls, ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
     ) -> "CandidateClass":
-        """Classifies the arms' behaviour with a control law and chosen gains.
+        """Classifies how the arms behave with a control law and chosen gains.
 
         If the scenario has walls or operators who push without a target pose, a second run
         without them shows at which pose the arms would come to rest undisturbed. The arms
@@ -285,8 +281,8 @@ class CandidateClass(StrEnum):
         operators.
 
         Args:
-            ends: Judgements of the end of the run and of the second run. Without a second run,
-                the judgement of the run is given twice.
+            ends: Analysis of the end of the run and of the second run. If there is no second
+                run, the first one is passed twice.
             fall_rad: Predicted distance, in rad, between the mean pose of the arms and q*, or
                 the mean of the promised motion, at the end of a run twice as long. The largest
                 distance over the joints counts.
@@ -329,7 +325,7 @@ _POSE_SAMPLES = 2000
 
 
 def check_final_posture(log: Log) -> list[str]:
-    """Warns if the end of a run shows little about its control law.
+    """Warns if the end of a run reveals little about its control law.
 
     There are three warnings:
 
@@ -346,7 +342,7 @@ def check_final_posture(log: Log) -> list[str]:
         The warnings, one sentence each. Empty if the log is complete and its arms did not fall.
 
     Raises:
-        LogError: A record (the result of a control period) cannot be read.
+        LogError: A record cannot be read.
     """
     site_logs = {site: log[site] for site in log.sites if len(log[site])}
     diverged_sites = [
@@ -368,7 +364,7 @@ def check_final_posture(log: Log) -> list[str]:
     for site, site_log in site_logs.items():
         in_last_second = site_log.t_s > site_log.t_s[-1] - END_WINDOW_S
         end_poses_rad[site] = site_log.q[in_last_second].mean(axis=0)
-    hanging = find_hanging_sites(log.scenario, end_poses_rad)
+    hanging = RunEnd.find_hanging_sites(log.scenario, end_poses_rad)
     if hanging:
         verb = "hangs" if len(hanging) == 1 else "hang"
         warnings.append(
@@ -425,13 +421,12 @@ class CandidateScore(msgspec.Struct, frozen=True):
         error_rad: RMS distance of the arms from the pose q*, in rad. `None` if the run
             diverged.
         spread_rad: Part of the error that is the distance between the arms at the same time,
-            without delays. For a law that promises another motion, it is the distance of the
+            with no delay. For a law that promises another motion, it is the distance of the
             arms from this motion.
         pose_rad: Part of the error that is the distance of the arms' mean from q*.
         effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
         settled_s: Time from which the largest |e| stays below 0.01 rad, in s, where e is the
-            error of a site against its peers, the arms that it follows. `None` if |e| is larger
-            at the end.
+            error of a site against its peers. `None` if |e| is larger at the end.
         saturated: Fraction of all joint torques that were at the torque limit.
         diverged_s: Time at which the first site left its limits, in s. `None` if no site did.
         seeds: Number of runs over which the score is averaged. The class is the worst class
@@ -458,8 +453,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
     def average(cls, scores: "Sequence[CandidateScore]") -> "CandidateScore":
         """Combines the scores of a candidate over runs that differ only in their seeds.
 
-        The class is the worst of all runs, and each number is the mean over the runs. A number
-        that is missing for one of the runs is `None`.
+        The class is the worst of all runs, and every other field is the mean over the runs, or
+        `None` if it is missing for one of them.
 
         Args:
             scores: Score of each run, at least one.
@@ -496,8 +491,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
 
         Args:
             text: Canonical text of the candidate's scenario.
-            twin_text: Canonical text of the twin's scenario. `None` if there is no twin. The
-                final pose is then taken from the candidate's own run.
+            twin_text: Canonical text of the twin's scenario. If `None`, there is no twin, and
+                the final pose is taken from the candidate's own run.
 
         Returns:
             The score of the candidate.
@@ -646,7 +641,7 @@ def _compute_promised_motion(
     alpha = np.zeros((len(t_s), len(laws), len(laws)))
     for site, name in enumerate(scenario.names):
         peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
-        alpha[:, site, peers] = DominancePlan.of_scenario(scenario, name).evaluate(t_s).alpha
+        alpha[:, site, peers] = DominanceHistory.of_scenario(scenario, name, t_s).alpha
     run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
     return laws[0].target_motion(run)
 
@@ -762,7 +757,7 @@ def _rms(values: Array) -> float:
 
 
 class TuningScenario(NamedTuple):
-    """The scenario in which control laws are compared, and the overrides that changed it.
+    """The scenario in which control laws are compared, and the overrides applied to it.
 
     The overrides are kept so that commands can name the scenario as the user did.
 
@@ -784,12 +779,11 @@ class TuningScenario(NamedTuple):
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
         """Returns this scenario with other control laws or gains, for example to compare them.
 
-        A table [control] in a scenario file sets the law and the gains of each arm. If all arms
-        get the same law and gains, they are set by one override (a changed setting), so that
-        commands stay short. Otherwise there is one override per arm.
+        If all arms get the same law and gains, they are set by a single override, which keeps
+        commands short. Otherwise there is one override per arm.
 
         Args:
-            controls: Table of each site.
+            controls: Table [control] of each site.
         """
         site_overrides = [
             f"sites.{name}.control={format_toml_value(table)}"
@@ -811,23 +805,23 @@ class TuningScenario(NamedTuple):
     def with_gains(
         self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
     ) -> "TuningScenario":
-        """Returns this scenario with another control law and other values of its gains.
+        """Returns this scenario with another control law and other gains.
 
         Args:
             space: The control law.
-            knowledge: Information about the arm that the law gets, such as its gravity
+            knowledge: Information about the arm available to the law, such as its gravity
                 parameters.
-            gains: Values of the gains, by their names.
+            gains: Mapping from gain name to value.
         """
         controls = space.controls(self.scenario, knowledge, gains)
         return self.with_controls(controls)
 
     @property
     def texts(self) -> tuple[str, str | None]:
-        """Texts of the scenario, and of the same scenario without walls and some operators.
+        """Texts of the scenario and of its twin, to be read by a worker process.
 
-        A worker process reads them. The second text leaves out walls, and operators who push
-        the arms without a target pose. It is `None` if the scenario has no such parts.
+        The twin excludes walls, and operators who push the arms without a target pose. Its text
+        is `None` if the scenario has none of these.
         """
         twin = build_twin(self.scenario)
         twin_text = None if twin is None else twin.text
@@ -849,7 +843,8 @@ class TuningScenario(NamedTuple):
         """Loads a scenario in which control laws are to be compared.
 
         Args:
-            source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+            source: Name of a shipped scenario, a path, a TOML string, its tables, or a
+                `Scenario`.
             overrides: Overrides KEY=VALUE of the scenario, as on the command line.
 
         Raises:
@@ -861,12 +856,12 @@ class TuningScenario(NamedTuple):
 
 
 class CandidateItem(NamedTuple):
-    """Everything that a worker process needs to simulate a control law with chosen gains.
+    """Everything that a worker process needs to run one candidate.
 
     Attributes:
-        runs: For each random seed, the text of the scenario, and the text of the same scenario
-            without walls and without operators who push the arms without a target pose. The
-            second text is `None` if the scenario has no such parts.
+        runs: For each random seed, the text of the scenario and the text of its twin, which
+            excludes walls and operators who push the arms without a target pose. The second
+            text is `None` if the scenario has none of these.
         name: Name of the law and its gains in error messages.
         is_side_by_side: True to compute the runs together with others, if possible.
     """
@@ -880,11 +875,10 @@ class CandidateItem(NamedTuple):
 
     @classmethod
     def of_seeds(cls, seeds: Sequence[TuningScenario]) -> "CandidateItem":
-        """Packs the simulations of one choice of control gains as work for another process.
+        """Packs the runs of one candidate as work for another process.
 
         Args:
-            seeds: The scenario with the law and its gains, once for each random seed, at least
-                once.
+            seeds: The scenario with the law and its gains for each random seed, at least one.
         """
         first = seeds[0]
         name = ", ".join(first.overrides) or first.source
@@ -892,9 +886,9 @@ class CandidateItem(NamedTuple):
         return cls(runs, name)
 
     def measure(self) -> "_MeasuredCandidate":
-        """Runs a candidate, a law with chosen gains, with all of its seeds.
+        """Runs the candidate with all of its seeds and scores it.
 
-        The method depends only on this object, so any worker process can call it.
+        The result depends only on this object, so any worker process can compute it.
         """
         scores = [CandidateScore.measure(text, twin_text) for text, twin_text in self.runs]
         return _MeasuredCandidate(CandidateScore.average(scores))
@@ -903,7 +897,7 @@ class CandidateItem(NamedTuple):
     def measure_together(
         cls, tasks: "Sequence[CandidateItem]"
     ) -> "Iterator[_MeasuredCandidate]":
-        """Runs several candidates with all of their seeds, side by side where that is possible.
+        """Runs several candidates with all of their seeds, side by side where possible.
 
         Args:
             tasks: The runs of each candidate.

@@ -1,17 +1,17 @@
 """Defines which gains of each control law a tuning searches, and within which ranges.
 
-For a fair comparison, a quantity has the same range in every law, whatever it is called there.
-For example, the stiffness is called K in some laws, and is the product of Kp and Lambda in
-others. Gains are searched uniformly in their logarithms. `SearchSpace.controls` turns chosen
-values into the table [control] of every arm in a scenario.
+For a fair comparison, each quantity has the same range in every law, under whatever name. For
+example, some laws have a stiffness K, and in others the stiffness is the product of Kp and
+Lambda. Gains are searched on a logarithmic scale. `SearchSpace.controls` turns chosen gains
+into the table [control] of every arm in a scenario.
 
 Invariant:
-    - A gain is a single number for both joints of an arm, and for all arms with the same role,
+    - Each gain is a single number for both joints of an arm and for all arms in the same role,
       such as the masters.
-    - For an arm with a chain of joints, the number is the gain of the joint with the largest
+    - For an arm with a chain of joints, this number is the gain of the joint with the largest
       inertia. The gains of the other joints are fractions of it, see `weigh_joints`.
-    - All laws get the same gravity parameters. They are the true values times a common factor,
-      which tests how robust the laws are.
+    - All laws get the same gravity parameters: the true values times a common factor, which
+      tests how robust the laws are.
     - Laws do not get the inertia of the arm. The only exception is `known`, the adaptive law
       without adaptation. A law that estimates the inertia starts at zero.
 """
@@ -43,10 +43,11 @@ def _round_parameter(value: float) -> float:
 
 
 class ModelInformation(NamedTuple):
-    """Information about the model of the arms that every compared control law gets.
+    """Information about the arm model that is available to every compared control law.
 
-    Some laws compensate gravity, for which they need parameters of the arm. To compare laws
-    fairly, all of them get the same parameters, which may be wrong by a chosen factor.
+    Some laws compensate for gravity, which requires parameters of the arm. For a fair
+    comparison, all laws get the same parameters, which may be deliberately wrong by a given
+    factor.
 
     Attributes:
         gravity: Ratio of the gravity parameters that the laws get to the true parameters.
@@ -56,42 +57,42 @@ class ModelInformation(NamedTuple):
 
     @property
     def box(self) -> float:
-        """Half width of the interval in which an adaptive law keeps an estimate, as a fraction.
+        """Half-width of the interval that bounds an adaptive law's estimate, as a fraction.
 
-        The fraction refers to the first estimate of the parameter, which is the centre of the
-        interval. The first estimates of gravity are wrong by the factor `gravity`. The interval
-        is twice as wide as needed to contain the true value, and has at least the half width
-        `MIN_BOX`.
+        The fraction is relative to the first estimate of the parameter, which is the centre of
+        the interval. The first estimates of gravity are wrong by the factor `gravity`. The
+        interval is twice as wide as needed to contain the true value, with a half-width of at
+        least `MIN_BOX`.
         """
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 
     def prior(self, scenario: Scenario, site: str) -> list[float]:
         """Returns the parameter values with which an adaptive law starts, shape (P,).
 
-        The P parameters theta of an arm describe its inertia and its gravity. The parameters of
-        inertia are 0, since nothing is known about them. The gravity parameters are the true
-        parameters times `gravity`.
+        The P parameters theta of an arm describe its inertia and its gravity torque. The
+        inertia parameters are 0, since nothing is known about them. The gravity parameters are
+        the true values times `gravity`.
 
         Args:
             scenario: Scenario in which the laws are compared.
-            site: Name of the site that runs the arm.
+            site: Name of the site.
         """
         arm = build_arm_rows(scenario, site)
         theta = np.where(arm.gravity_parameters, arm.theta * self.gravity, 0.0)
         return [_round_parameter(value) for value in theta]
 
     def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
-        """Returns the limits within which an adaptive law keeps its parameter estimates.
+        """Returns the limits to which an adaptive law confines its parameter estimates.
 
-        The P parameters of an arm describe its inertia and its gravity torque. Estimates of
-        inertia are practically not limited, because nothing is known about the inertia.
+        The P parameters of an arm describe its inertia and its gravity torque. Inertia
+        estimates are practically unlimited, because nothing is known about the inertia.
 
         Args:
             scenario: Scenario with the arm.
             site: Name of the arm in the scenario.
 
         Returns:
-            Lower and upper limits of the parameters, P numbers each.
+            Lower and upper limits of the P parameters.
         """
         is_gravity = build_arm_rows(scenario, site).gravity_parameters.tolist()
         estimate = self.prior(scenario, site)
@@ -109,7 +110,7 @@ class ModelInformation(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Clause for reports that states the laws' information about the arms.
+        """Clause for reports that states what the laws know about the arms.
 
         Example: "every law gets 90 % of the true gravity parameters, and no inertia".
         """
@@ -121,16 +122,16 @@ class ModelInformation(NamedTuple):
 
     @classmethod
     def of_gravity(cls, gravity_percent: float) -> "ModelInformation":
-        """Returns the information about the arms that all compared control laws get.
+        """Creates the information for a given error of the gravity parameters.
 
-        The gravity parameters may be deliberately wrong, to test how robust the laws are.
+        The parameters may be deliberately wrong, to test how robust the laws are.
 
         Args:
             gravity_percent: Gravity parameters that the laws get, in per cent of the true
                 values.
 
         Raises:
-            UsageError: The number is not from 50 to 150.
+            UsageError: The percentage is not between 50 and 150.
         """
         if not 50.0 <= gravity_percent <= 150.0:
             raise UsageError(
@@ -167,9 +168,9 @@ class SearchSpace(NamedTuple):
     """Gains of one control law that are tuned automatically, with their units and ranges.
 
     Attributes:
-        law: Name of the law. The name "known" means the law `adaptive` without adaptation,
-            which gets the true inertia of the arm.
-        knobs: Gains that are searched, with their units and ranges.
+        law: Name of the law. "known" stands for the law `adaptive` without adaptation, which
+            gets the true inertia of the arm.
+        knobs: Gains to search, with their units and ranges.
         known_facts: Information about the arm that the law gets, as text for tables.
         kind: Class of a built-in law. `None` for a user's law.
     """
@@ -182,19 +183,18 @@ class SearchSpace(NamedTuple):
     def controls(
         self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues
     ) -> SiteControls:
-        """Returns the control settings of every arm for chosen values of the gains.
+        """Returns the table [control] of every arm for the given gains.
 
-        The settings are the table [control] of a scenario. For any arm except the planar arm
-        with two joints, a gain that produces a torque becomes a list with a value per joint,
-        because the joints have different inertias, see `weigh_joints`.
+        Except for the planar two-joint arm, a gain that produces a torque becomes a list with
+        one value per joint, because the joints have different inertias, see `weigh_joints`.
 
         Args:
             scenario: Scenario in which the laws are compared.
             knowledge: Information about the arm that the law gets.
-            gains: Values of the gains, by their names.
+            gains: Mapping from gain name to value.
 
         Returns:
-            The settings, by the name of the arm.
+            The tables, by the name of the arm.
         """
         longest_ms = 0.5 * _find_longest_round_trip_ms(scenario)
         tables = {}
@@ -256,9 +256,9 @@ class SearchSpace(NamedTuple):
     def of_user_law(cls, code: str) -> "SearchSpace":
         """Reads the search space of a user's law from the attribute `tune` of its class.
 
-        The attribute contains (low, high) or (low, high, unit) for each gain, as in `tune =
-        {"K": (10.0, 300.0)}`. If the constructor of the class has an argument `gravity`, it
-        gets the factor by which all laws over- or underestimate gravity.
+        The attribute maps each gain to (low, high) or (low, high, unit), as in `tune = {"K":
+        (10.0, 300.0)}`. If the constructor of the class has an argument `gravity`, it gets the
+        factor by which all laws over- or underestimate gravity.
 
         Args:
             code: Module and class, as in "mylaws:Spring".
@@ -286,11 +286,11 @@ class SearchSpace(NamedTuple):
 
     @classmethod
     def select(cls, laws: Sequence[str], scenario: Scenario) -> "list[SearchSpace]":
-        """Returns the gains of the given control laws that are tuned, without repeated laws.
+        """Returns the search spaces of the given control laws, dropping repeated laws.
 
         Args:
             laws: Names of built-in laws, or classes as in "mylaws:Spring". If empty,
-                `DEFAULT_LAWS` are used.
+                `DEFAULT_LAWS`.
             scenario: Scenario in which the laws are compared.
 
         Raises:
@@ -350,15 +350,15 @@ _STABLE_SHARE = 0.9
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
-    """Returns a factor for each joint of a chain that scales gains which produce a torque.
+    """Returns, for each joint of a chain, a factor that scales gains which produce a torque.
 
     The factor of joint i is its inertia while the other joints are free, 1 / (M^-1)_ii,
-    relative to the largest such inertia of all joints. M is the inertia matrix. Among the start
-    poses of the sites, the pose with the least inertia is used.
+    relative to the largest such inertia of all joints, where M is the inertia matrix. Among the
+    start poses of the sites, the pose with the least inertia is used.
 
-    All factors are reduced if the largest damping of the ranges would be unstable at the arms'
-    tick rate. `validate` rejects damping gains D for which the largest eigenvalue of h M^-1 D,
-    with the period h of a tick, reaches 1 under the integration scheme `second_order`, or 2
+    All factors are reduced if the largest damping in the search ranges would be unstable at the
+    arms' tick rate. `validate` rejects damping gains D for which the largest eigenvalue of h
+    M^-1 D, with the tick period h, reaches 1 under the integration scheme `second_order`, or 2
     under `digital`.
 
     Args:

@@ -1,20 +1,20 @@
-"""Tunes the gains of several control laws, and finds the best compromises of each.
+"""Tunes the gains of several control laws and finds the best trade-offs of each.
 
 Two objectives are minimised: the error, and the effort of the motors. The result for a law is
 its Pareto front: the gains for which no other gains of the law are better in both. The laws can
-then be compared fairly, because the same number of attempts (candidates) was made for each.
+then be compared fairly, because the same number of candidates was tried for each.
 
 The first half of the candidates is a Latin hypercube, an evenly spread random sample, in the
 logarithms of the gains (McKay, Beckman and Conover, Technometrics 21, 1979). The second half
-refines the law's own front, in four rounds with shrinking steps.
+refines the law's own front, in four rounds with decreasing step sizes.
 
 Invariant:
-    - The result depends only on the plan, and not on the number of processes or on their speed.
+    - The result depends only on the plan, not on the number of processes or on their speed.
     - The candidates depend only on the seed, the search space and the scores of earlier rounds.
     - Only stable runs that end at the common pose of the arms compete. Of two runs with equal
       objectives, the first is kept.
-    - The gains that the paper prints are measured, but do not take part in the search and
-      belong to no front.
+    - The gains printed in the paper are measured, but do not take part in the search and belong
+      to no front.
 """
 
 from collections import Counter
@@ -34,7 +34,7 @@ from trilat_net.net import SystemClock
 from trilat_net.own_code import name_law_classes
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.work import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
 from trilat_net.workers import count_cores
 
 from ..side_by_side import RunKind, prepare_kinds
@@ -61,9 +61,9 @@ ObjectivePoint = tuple[float, float]
 
 
 class Objective(StrEnum):
-    """Quantity that a tuning minimises besides the motor effort: error or settling time.
+    """Quantity to minimise in addition to the motor effort: error or settling time.
 
-    In general, both conflict with the effort: a smaller error needs larger torques.
+    Both usually conflict with the effort: a smaller error needs larger torques.
     """
 
     ERROR = "error"
@@ -71,20 +71,20 @@ class Objective(StrEnum):
 
     @property
     def unit(self) -> str:
-        """Unit of the tuned quantity in tables and on axes: rad for an error, s for a time."""
+        """Unit of the objective in tables and on axes: rad for an error, s for a time."""
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
-        """Returns the error (or time) and the motor effort of a candidate, to compare both.
+        """Returns the objective (error or time) and the motor effort of a candidate.
 
-        The candidates that no other candidate beats in both form the Pareto front.
+        The Pareto front consists of the candidates that no other candidate beats in both.
 
         Args:
             score: Score of the candidate.
 
         Returns:
-            The objective and the effort. `None` if the candidate may not be part of a Pareto
-            front, because it is not stable or does not end at the common pose.
+            The objective and the effort, or `None` if the candidate cannot be on a Pareto front
+            because it is not stable or does not end at the common pose.
         """
         value = score.error_rad if self is Objective.ERROR else score.settled_s
         if score.outcome is not CandidateClass.SETTLED:
@@ -95,10 +95,9 @@ class Objective(StrEnum):
 
 
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
-    """Returns the indices of the points of the Pareto front, in the order of rising effort.
+    """Returns the indices of the points on the Pareto front, in order of increasing effort.
 
-    The front contains the best compromises between both objectives: a point belongs to the
-    front if no other point is at least as good in both objectives.
+    A point is on the front if no other point is at least as good in both objectives.
 
     Args:
         points: The points. `None` represents a run that does not compete.
@@ -119,18 +118,18 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Computes how isolated each point of a front is, so that gaps in the front can be refined.
+    """Computes how isolated each point of a front is, to find gaps that should be refined.
 
     The crowding distance of a point is half the perimeter of the box between its two
-    neighbours, where each side is relative to the span of the front. It is infinite for the
-    first and the last point. Source: Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist
+    neighbours, with each side relative to the span of the front. It is infinite for the first
+    and the last point. Source: Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist
     multiobjective genetic algorithm: NSGA-II", IEEE Trans. Evolutionary Computation 6 (2002).
 
     Args:
-        points: Points of the front, in the order of rising effort.
+        points: Points of the front, in order of increasing effort.
 
     Returns:
-        The distance of each point, large for isolated points.
+        The crowding distance of each point. Larger values mean more isolated points.
     """
     if len(points) < 3:
         return [float("inf")] * len(points)
@@ -161,20 +160,20 @@ CandidateGains = dict[str, float]
 class CandidateSearch:
     """Search for the best gains of one control law, in several rounds.
 
-    A candidate is one choice of values of the gains. In each round, the caller runs the
-    candidates of `propose_candidates` and passes their scores to `record_scores`. The result is
-    the Pareto front of the law: the best compromises between the objective and the effort.
+    A candidate is one choice of gains. In each round, the caller runs the candidates returned
+    by `propose_candidates` and passes their scores to `record_scores`. The result is the law's
+    Pareto front, which contains the best trade-offs between objective and effort.
 
     Args:
         space: The law and the ranges of its gains.
         budget: Number of candidates.
-        seed: Seed of the random numbers, which is the same for every law.
+        seed: Random seed, which is the same for every law.
         objective: Objective besides the effort.
 
     Attributes:
         tried: Gains of all candidates that have run, in order.
         scores: Scores of these candidates, in the same order.
-        rounds: Number of candidates of each round. Their sum is the budget.
+        rounds: Number of candidates in each round. They add up to the budget.
     """
 
     def __init__(
@@ -200,30 +199,29 @@ class CandidateSearch:
 
     @property
     def points(self) -> list[ObjectivePoint | None]:
-        """Objective and effort of each tried choice of gains, in the order of the runs.
+        """Objective and effort of each candidate that was tried, in order of execution.
 
         The objective is the error, in rad, or the settling time, in s. The effort is the RMS
-        motor torque without gravity, in N m. `None` represents gains that do not compete,
-        because the arms were not stable or did not end at the common pose.
+        motor torque excluding gravity, in N m. `None` stands for a candidate that does not
+        compete, because the arms were not stable or did not end at the common pose.
         """
         return [self._objective.point(score) for score in self.scores]
 
     @property
     def front(self) -> list[int]:
-        """Indices of the gains that are the best compromises, in order of rising effort.
+        """Indices in `tried` of the candidates on the law's Pareto front, by increasing effort.
 
-        An index refers to `tried`. These gains are the Pareto front of the law: no other tried
-        gains are at least as good in both objective and effort. The objective is the error or
-        the settling time, and the effort is the RMS motor torque without gravity.
+        No other candidate of the law is at least as good in both the objective (error or
+        settling time) and the effort (RMS motor torque excluding gravity).
         """
         return find_pareto_front(self.points)
 
     @property
     def front_points(self) -> list[ObjectivePoint]:
-        """Objective and effort of the best compromises that the search has found for this law.
+        """Objective and effort of the candidates on the Pareto front, by increasing effort.
 
         The objective is the error, in rad, or the settling time, in s. The effort is the RMS
-        motor torque without gravity, in N m. The pairs are in the order of rising effort.
+        motor torque excluding gravity, in N m.
         """
         points = self.points
         front_points = []
@@ -235,7 +233,7 @@ class CandidateSearch:
 
     @property
     def outcomes(self) -> dict[CandidateClass, int]:
-        """Number of tried choices of gains in each class, such as settled or diverged.
+        """Number of candidates in each class, such as settled or diverged.
 
         The class states how well the arms behaved, see `CandidateClass`.
         """
@@ -243,11 +241,11 @@ class CandidateSearch:
         return {outcome: counts[outcome] for outcome in CandidateClass}
 
     def propose_candidates(self, round_number: int) -> list[CandidateGains]:
-        """Returns the gains to try in a round.
+        """Returns the candidates to try in a round.
 
-        The first round spreads its candidates evenly over the ranges of the gains by a Latin
-        hypercube. The later rounds refine the best candidates so far. Therefore the scores of
-        all earlier rounds must have been recorded.
+        The first round is a Latin hypercube, which spreads its candidates evenly over the
+        ranges of the gains. Later rounds refine the best candidates so far, and require that
+        the scores of all earlier rounds have been recorded.
 
         Args:
             round_number: 0 for the Latin hypercube, and 1 to 4 for the refinement rounds.
@@ -269,7 +267,7 @@ class CandidateSearch:
     def record_scores(
         self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
     ) -> None:
-        """Stores the scores of some gains, from which the next gains are proposed.
+        """Stores the scores of candidates, on which the next proposals are based.
 
         Args:
             gains: The candidates that were run.
@@ -381,17 +379,17 @@ class _PaperGainsResult(NamedTuple):
 
 
 class TuningPlan(NamedTuple):
-    """A comparison of control laws, each with the best gains that a search finds, ready to run.
+    """A comparison of control laws with tuned gains, ready to run.
 
-    `plan_tuning` creates this object and checks it. `run` executes the searches.
+    `plan_tuning` creates and checks this object. `run` executes the searches.
 
     Attributes:
         base: Scenario in which the laws are compared.
         spaces: The laws with their search spaces.
         budget: Number of candidates per law.
-        seed: Seed of the search.
+        seed: Random seed of the search.
         objective: Objective besides the effort.
-        knowledge: Information about the model of the arms that all laws get.
+        knowledge: Information about the arm model that is available to all laws.
         others: The scenario with further seeds. The score of a candidate is the mean over all
             seeds.
     """
@@ -408,7 +406,7 @@ class TuningPlan(NamedTuple):
     def runs(self) -> int:
         """Number of all simulated runs of the comparison.
 
-        The number includes the runs with the published gains, and the second runs that measure
+        The number includes the runs with the published gains and the additional runs that find
         the final pose of the arms in some scenarios.
         """
         paper_candidates = len(self.build_paper_scenarios(self.base))
@@ -419,20 +417,20 @@ class TuningPlan(NamedTuple):
 
     @property
     def twin(self) -> bool:
-        """True if every choice of gains needs a second run, which measures the final pose.
+        """True if every candidate needs a second run to find the final pose.
 
         This is the case if the scenario has walls, or operators who push the arms without a
         target pose. They keep the arms away from the pose at which the arms would rest
-        undisturbed, so the second run leaves them out.
+        undisturbed, so the second run excludes them.
         """
         return build_twin(self.base.scenario) is not None
 
     def build_paper_scenarios(self, base: TuningScenario) -> dict[str, TuningScenario]:
         """Returns the scenario with the published gains of the adaptive law, in two variants.
 
-        The gains are printed in the paper from which the law comes. In the first variant, the
-        law gets the same gravity parameters as all compared laws. In the second variant, the
-        law gets no information about the arm.
+        The gains are those printed in the paper that introduced the law. In the first variant,
+        the law gets the same gravity parameters as all compared laws. In the second, it gets no
+        information about the arm.
 
         Args:
             base: The scenario.
@@ -449,10 +447,10 @@ class TuningPlan(NamedTuple):
         }
 
     def estimate_s(self, jobs: int | None = None) -> float:
-        """Estimates from a short simulation how long the tuning takes, in s of real time.
+        """Estimates from a short simulation how long the tuning will take, in s of real time.
 
         Args:
-            jobs: Number of worker processes. If `None`, all cores are used.
+            jobs: Number of worker processes. If `None`, one per core.
         """
         scenario = self.base.scenario
         probe_s = min(scenario.duration_s, _PROBE_S)
@@ -472,12 +470,13 @@ class TuningPlan(NamedTuple):
     ) -> "TuningResult":
         """Searches for the best gains of all laws.
 
-        In each round, the candidates of all laws are run together, so that no worker waits for
+        In each round, the candidates of all laws are run together, so workers need not wait for
         the slowest candidate of each law.
 
         Args:
-            jobs: Number of worker processes. If `None`, all cores are used.
-            progress: Function that is called with the number of finished and of all candidates.
+            jobs: Number of worker processes. If `None`, one per core.
+            progress: Called with the number of finished candidates and the total number of
+                candidates.
             on: Workers to use instead of processes on this machine.
 
         Raises:
@@ -505,7 +504,7 @@ class TuningPlan(NamedTuple):
         if not is_core_cached():
             # A short run compiles the simulation kernel once, before the processes start.
             FusedRun(self.base.scenario).advance_to(_PROBE_S)
-        with open_worker_pool(jobs, on, most=total) as pool:
+        with WorkerPool.open(jobs, on, most=total) as pool:
             for round_number in range(len(searches[0].rounds)):
                 proposals = [search.propose_candidates(round_number) for search in searches]
                 items_of_laws = [
@@ -582,15 +581,16 @@ _EDGE = 1.02
 
 @dataclass(frozen=True, repr=False)
 class TuningResult(Result):
-    """Comparison of control laws, each with the best gains that a search has found.
+    """Result of comparing control laws, each with the best gains that the search found.
 
     Attributes:
         plan: The comparison: its scenario, the laws and the ranges of their gains.
-        found: For each law in the order of the plan, all tried gains and their scores.
-        printed: Scores of the published gains of the adaptive law, for comparison. They are
-            printed in the paper from which the law comes.
-        alone: Reasons why runs were not computed side by side with others, with the number of
-            these runs. Runs of a search that computes all runs one by one are not counted.
+        found: For each law in the order of the plan, all gains that were tried and their
+            scores.
+        printed: Scores of the published gains of the adaptive law (those in the paper that
+            introduced it), for comparison.
+        alone: Maps each reason why runs were not computed side by side with others to the
+            number of these runs. Not used in a search that computes all runs one at a time.
     """
 
     plan: TuningPlan
@@ -599,7 +599,7 @@ class TuningResult(Result):
     alone: Mapping[str, int] = field(default_factory=dict)
 
     def blocks(self) -> Iterator[Any]:
-        """Yields the text that `trilat compare --tune` prints about the tuning, part by part.
+        """Yields the sections of the report that `trilat compare --tune` prints.
 
         See `TuningReport.compose`.
         """
@@ -616,11 +616,11 @@ class TuningResult(Result):
         return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat compare --tune --json` prints it.
+        """Converts the result to the plain values that `trilat compare --tune --json` prints.
 
         Returns:
             The scenario, the procedure, the results of each law, and the scores of the
-            published gains, each with the command that repeats its run.
+            published gains. Each score comes with the command that repeats its run.
         """
         printed = []
         for result in self.printed:
@@ -711,10 +711,7 @@ class TuningResult(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of all candidates that were tried, one row per candidate of each law.
-
-        A row contains plain values, ready for CSV.
-        """
+        """Returns one row of plain values, ready for CSV, per candidate of each law."""
         rows = []
         for law, facts in self.to_dict()["laws"].items():
             for candidate in facts["candidates"]:
@@ -723,7 +720,7 @@ class TuningResult(Result):
         return rows
 
     def candidate(self, search: CandidateSearch, index: int) -> TuningScenario:
-        """Returns the scenario with the gains of one candidate, to simulate it again.
+        """Returns the scenario with the gains of one candidate, for simulating it again.
 
         Args:
             search: Search of the candidate's law.
@@ -735,14 +732,14 @@ class TuningResult(Result):
     def list_edge_gains(self, search: CandidateSearch) -> list[str]:
         """Lists the gains whose best value lies at an end of the searched range.
 
-        Such a range should be widened, because a better value may lie outside of it. The best
-        candidate of the law is the one with the least objective.
+        The range of such a gain should be widened, because a better value may lie outside. The
+        best candidate of a law is the one with the smallest objective.
 
         Args:
             search: Search of the law.
 
         Returns:
-            A string for each such gain. Empty if there is no such gain.
+            One string per such gain. May be empty.
         """
         if not search.front:
             return []
@@ -755,16 +752,17 @@ class TuningResult(Result):
         return names
 
     def list_overall_front(self, search: CandidateSearch) -> list[int]:
-        """Lists the gains of a law that are on the common Pareto front of all compared laws.
+        """Lists the candidates of a law that are on the common Pareto front of all laws.
 
-        Gains are on the front if no other gains of any law have both a smaller objective (error
-        or settling time) and a smaller effort (motor torque).
+        A candidate is on this front if no other candidate of any law has both a smaller
+        objective (error or settling time) and a smaller effort (motor torque).
 
         Args:
-            search: Tried gains of the law, with their scores.
+            search: Candidates of the law, with their scores.
 
         Returns:
-            Indices of the gains in `search.tried`. Empty if other laws are better everywhere.
+            Indices of the candidates in `search.tried`. Empty if other laws are better
+            everywhere.
         """
         points = []
         candidates = []
@@ -791,7 +789,7 @@ def plan_tuning(
 ) -> TuningPlan:
     """Plans a comparison of control laws with tuned gains, and checks that it can run.
 
-    The arguments are explained in `trilat_net.tune`. Overrides are texts KEY=VALUE. With
+    The arguments are explained in `trilat_net.tune`. Overrides are strings KEY=VALUE. With
     several seeds, the first is the seed of the scenario, and each further seed is larger by 1.
 
     Returns:

@@ -1,12 +1,11 @@
-"""Reports a comparison of control laws as tables, a Markdown page, JSON and a figure.
+"""Reports a comparison of tuned control laws as tables, a Markdown page, JSON and a figure.
 
-Before the comparison, the gains of each law were tuned by a search. The figure shows error
-against effort, the RMS motor torque, for the Pareto front of each law: the gains for which no
-other gains of the law are better in both. `TuningReport.write` writes the files front.json,
-front.md, front.png and front.pdf.
+The figure shows error against effort (the RMS motor torque) for the Pareto front of each law:
+the gains for which no other gains of the law are better in both. `TuningReport.write` writes
+the files front.json, front.md, front.png and front.pdf.
 
 Invariant:
-    - The files depend only on the result. Repeating the same comparison gives equal bytes.
+    - The files depend only on the result. Repeating the same comparison gives identical bytes.
     - The JSON contains the complete result. The other files are views of it.
     - Each run is counted in exactly one class, such as stable or diverged.
     - The figure shows every stable run in which the arms end at the operators' target pose,
@@ -50,7 +49,7 @@ _MAX_FRONT_ROWS = 8
 
 
 class TuningReport:
-    """Report of a comparison of tuned control laws: text, tables, page and figure.
+    """Report on a comparison of tuned control laws: text, tables, page and figure.
 
     Args:
         tuned: Result of the comparison.
@@ -60,11 +59,12 @@ class TuningReport:
         self._tuned = tuned
 
     def compose(self) -> Iterator[Block]:
-        """Yields the text that reports a comparison of tuned control laws on the terminal.
+        """Yields the sections of the report that is printed on the terminal.
 
-        The text contains a table of the laws, explanations of the classes of behaviour, and the
-        best compromises between error and effort (the Pareto front) of each law. The scores of
-        the published gains, notes, and commands that repeat the best runs follow.
+        The report begins with a table of the laws, explanations of the behaviour classes, and
+        each law's Pareto front, which contains its best trade-offs between error and effort.
+        The scores of the published gains, notes, and the commands that repeat the best runs
+        follow.
         """
         yield self._tabulate_laws()
         yield from (f"  {line}" for line in _list_class_meanings())
@@ -105,10 +105,10 @@ class TuningReport:
                 yield f"  {self._tuned.candidate(search, last_point).command}"
 
     def write(self, folder: Path) -> list[Path]:
-        """Writes the results of a comparison into an existing folder.
+        """Writes the results of the comparison into an existing folder.
 
-        The files are the results as JSON, a page in Markdown, and the figure of the fronts as
-        PNG and PDF.
+        The files are the results as JSON, a Markdown page, and the figure of the fronts as PNG
+        and PDF.
 
         Args:
             folder: The folder.
@@ -128,10 +128,11 @@ class TuningReport:
         return [json_path, page_path, *picture_paths]
 
     def list_energy_notes(self) -> list[str]:
-        """Returns notes on energies that a tuning does not check, for laws that declare them.
+        """Returns notes on laws with a declared energy, which the tuning does not check.
 
-        The classes depend on the motion of the arms. A run in which a law's declared energy
-        became negative can therefore count as stable here, while its certificate is open.
+        The tuning classifies runs by the motion of the arms only. A run in which a law's
+        declared energy became negative can therefore count as stable here, while its
+        certificate is open.
         """
         laws = []
         for search in self._tuned.found:
@@ -146,10 +147,10 @@ class TuningReport:
         ]
 
     def tabulate_front(self, search: "CandidateSearch", most: int | None = None) -> TextTable:
-        """Returns a table of the candidates on a law's Pareto front, by rising effort.
+        """Returns a table of the candidates on a law's Pareto front, by increasing effort.
 
         A candidate is on the front if no other candidate has both a smaller error and a smaller
-        effort. A * marks the candidates that are also on the common front of all laws.
+        effort. A * marks candidates that are also on the common front of all laws.
 
         Args:
             search: Search of the law.
@@ -356,8 +357,8 @@ def _format_mean(mean: float | None, half: float | None) -> str:
 def describe_procedure(plan: "TuningPlan") -> list[str]:
     """Describes the conditions that are the same for all compared laws, in one sentence each.
 
-    The sentences cover the candidates, the scenario, the model information that laws get, the
-    objectives, and conditions that apply only to some comparisons.
+    The sentences cover the candidates, the scenario, the model information available to the
+    laws, the objectives, and conditions that apply only to some comparisons.
 
     Args:
         plan: The comparison.

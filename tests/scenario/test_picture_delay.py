@@ -8,7 +8,7 @@ import pytest
 import trilat_net as tn
 from trilat_net.core.links.philox import link_key
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.sample_uses import PictureDelay, draw_used_samples
+from trilat_net.scenario.picture_delay import PictureDelay
 
 MODELS = {
     "constant": {"delay_ms": 130.0},
@@ -42,7 +42,7 @@ def test_pictures_are_delayed_like_links(view: dict[str, Any], peer_hz: int) -> 
     picture = PictureDelay(scenario, "m1")
     model = scenario.sites["m1"].view
     assert model is not None
-    used = draw_used_samples(model, link_key(scenario.seed, "view s->m1"), 1000, peer_hz, 2.0)
+    used = model.draw_used_samples(link_key(scenario.seed, "view s->m1"), 1000, peer_hz, 2.0)
     assert [picture.advance_to(tick, {})["s"] for tick in range(2000)] == used.tolist()
 
 
