@@ -368,8 +368,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def read_default_settings(self) -> dict[str, Any]:
-        """Returns the defaults of the class's arguments, which apply if the scenario omits
-        them.
+        """Returns the defaults of the class's arguments, used if the scenario omits them.
 
         They are read from the file of the law, which is not run. A default that is not a
         literal is returned as its Python source text.
