@@ -1,12 +1,12 @@
-"""A LeRobot robot through which a policy drives one of the two masters of a trilat-net session.
+"""A LeRobot robot that lets a policy drive one of the two masters of a trilat-net session.
 
-In such a session a slave arm follows two master arms. The policy drives one master, and another
-user drives the other. An action of the policy moves its master as an operator would (a "live
-hand" of the scenario). An observation consists of the newest states of the slave and of that
-master, and of the position and force of the operator.
+In such a session, a slave arm follows two master arms, one driven by the policy and the other
+by another user. An action of the policy moves its master as an operator would (a "live hand" of
+the scenario). An observation consists of the newest states of the slave and of that master, and
+of the position and force of the operator.
 
 `python -m lerobot_robot_trilat FOLDER` runs a trained policy in a session. `lerobot-rollout` of
-LeRobot 0.6.1 cannot do this, because it leaves out torques, forces and
+LeRobot 0.6.1 cannot do this, because it omits torques, forces and
 `observation.environment_state`.
 
 Invariant:
@@ -34,7 +34,7 @@ _HAND_COMMANDS = {
 }
 """Commands of a hand (operator) in each mode.
 
-The values are the method of `tn.hand`, and the suffix of the keys of a command.
+Maps each mode to the method of `tn.hand` and the suffix of the keys of a command.
 """
 
 
@@ -43,18 +43,16 @@ The values are the method of `tn.hand`, and the suffix of the keys of a command.
 class TrilatRobotConfig(RobotConfig):
     """Settings of a `TrilatRobot`: the session, and the site that the policy drives.
 
-    A site is an arm with its control loop.
-
     Attributes:
         session: Name of the session.
-        scenario: Name or path of the scenario of the session. Empty if it has the name of the
-            session.
+        scenario: Name or path of the scenario of the session. Empty if it has the same name as
+            the session.
         site: Name of the master that the policy drives.
         slave: Name of the slave, which the policy also observes.
         connect: Network endpoints of the session. Empty for the default endpoints on this
             machine.
         keys: Folder of the operator's keys. Empty for a session without keys.
-        timeout_s: Longest wait for the session, in s.
+        timeout_s: Maximum time to wait for the session, in s.
     """
 
     session: str = "play"
@@ -67,7 +65,7 @@ class TrilatRobotConfig(RobotConfig):
 
 
 class TrilatRobot(Robot):
-    """Robot for LeRobot: the slave arm and one master arm of a session of trilat-net.
+    """LeRobot robot that consists of the slave and one master of a trilat-net session.
 
     A policy observes both arms and drives the master, which the slave follows. LeRobot creates
     the object from a `TrilatRobotConfig`, and calls its methods in a loop.
@@ -105,19 +103,20 @@ class TrilatRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Names and types of the numbers that LeRobot receives as an observation of the robot.
+        """Names and types of the values that LeRobot receives as an observation of the robot.
 
-        The numbers are the states of both arms, and the position and force of the operator, the
-        program that moves the master arm. A joint has its angle in rad, its velocity in rad/s
-        and its external torque in N m. The operator has a position in m, and feels a force in
-        N. In mode `joint` these are angles in rad and torques in N m.
+        An observation contains the states of both arms, and the position and force of the
+        operator, the program that moves the master. For each joint, it contains the angle in
+        rad, the velocity in rad/s and the external torque in N m. For the operator, it contains
+        the position in m and the force on the operator in N, or angles in rad and torques in N
+        m in mode `joint`.
         """
         keys = [*self._joint_keys, *self._position_keys, *self._felt_keys]
         return dict.fromkeys(keys, float)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Keys of an action: a command of the operator.
+        """Keys of an action, which is a command of the operator.
 
         Depending on the mode in the scenario, the command is a position in m (mode `tip`),
         angles in rad (`joint`) or a force in N (`force`).
@@ -128,14 +127,14 @@ class TrilatRobot(Robot):
     def is_connected(self) -> bool:
         """True between `connect` and `disconnect`.
 
-        It stays true after the end of the session, because LeRobot disconnects a device only if
-        it is connected, and a device that is not disconnected keeps the process alive.
+        Stays True after the end of the session, because LeRobot disconnects a device only if it
+        is connected, and a device that is not disconnected keeps the process alive.
         """
         return self._hand is not None
 
     @property
     def is_calibrated(self) -> bool:
-        """Always True: no calibration is needed, as the scenario file describes the arms."""
+        """Always True. No calibration is needed, because the scenario describes the arms."""
         return True
 
     def calibrate(self) -> None:
@@ -148,7 +147,7 @@ class TrilatRobot(Robot):
         """Joins the teleoperation session, and waits for the first state of both arms.
 
         Args:
-            calibrate: Not used, because there is nothing to calibrate.
+            calibrate: Ignored, because there is nothing to calibrate.
 
         Raises:
             DeviceAlreadyConnectedError: The robot is already connected.
@@ -178,7 +177,7 @@ class TrilatRobot(Robot):
             self._stack = stack.pop_all()
 
     def _await_records(self, timeout_s: float) -> None:
-        """Waits until both arm controllers (sites) have published their state.
+        """Waits until both sites have published their state.
 
         Raises:
             DeviceNotConnectedError: A site has published no record for `timeout_s` seconds.
@@ -194,7 +193,7 @@ class TrilatRobot(Robot):
             self._receive_newest()
 
     def _receive_newest(self) -> None:
-        """Receives all new records, the states of sites, and keeps the newest of each site."""
+        """Receives all new records, and keeps the newest of each site."""
         for record in self._receive_records():
             self._records[record.site] = record
 
@@ -202,10 +201,11 @@ class TrilatRobot(Robot):
         """Returns the newest states of the slave and of the driven master, for the policy.
 
         The state of an arm consists of the angles, velocities and external torques of its
-        joints. The position of the operator and the reaction to the operator's force follow.
+        joints, followed by the position of the operator and the reaction to the operator's
+        force.
 
         Returns:
-            Numbers with the keys of `observation_features`.
+            Values with the keys of `observation_features`.
         """
         hand = self._require_running_hand()
         self._receive_newest()
@@ -219,9 +219,9 @@ class TrilatRobot(Robot):
         return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Sends the policy's decision to the operator that moves the master arm.
+        """Sends an action of the policy to the operator that moves the master arm.
 
-        The site enforces the limits of force and speed.
+        The site enforces the limits on force and speed.
 
         Args:
             action: A command, with the keys of `action_features`.
@@ -244,9 +244,9 @@ class TrilatRobot(Robot):
         self._stack.close()
 
     def _require_running_hand(self) -> Any:
-        """Returns the connection of the operator while the session runs.
+        """Returns the connection of the operator, if the session is running.
 
-        After the end of the session, the newest record would be observed again and again.
+        After the end of the session, the newest record would be observed over and over.
 
         Raises:
             DeviceNotConnectedError: The robot is not connected, or the session has ended.
@@ -259,7 +259,7 @@ class TrilatRobot(Robot):
         return hand
 
     def _require_hand(self) -> Any:
-        """Returns the connection with which the policy acts as an operator.
+        """Returns the connection through which the policy acts as an operator.
 
         Raises:
             DeviceNotConnectedError: The robot is not connected; call `connect` first.
@@ -270,10 +270,10 @@ class TrilatRobot(Robot):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns whether a program may move a site's arm by "force" or by "position".
+    """Returns the mode in which a program may move a site's arm, such as "tip" or "force".
 
-    The scenario (settings of the session) decides this in its entry for a live operator (hand),
-    whose commands come from another program.
+    The scenario determines the mode in its entry for a live operator (hand), whose commands
+    come from another program.
 
     Args:
         scenario: The scenario of the session.
@@ -318,15 +318,15 @@ def run_policy(
     duration_s: float,
     fps: int,
 ) -> int:
-    """Lets a trained policy move the arm of a robot, at a fixed rate.
+    """Runs a trained policy that moves the arm of a robot, at a fixed rate.
 
     Args:
         robot: The connected robot.
         decide: The policy. Its argument has the keys of an exported dataset,
-            `observation.state` and `observation.environment_state`. Its result has a number for
+            `observation.state` and `observation.environment_state`. It returns one number for
             each key of `action_features`.
         duration_s: Time after which the policy ends, in s.
-        fps: Number of decisions per second, as in the dataset of the training.
+        fps: Number of decisions per second, as in the training dataset.
 
     Returns:
         The number of decisions.
@@ -352,7 +352,7 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
     """Loads a trained policy that `lerobot-train` has stored in a folder.
 
     Args:
-        folder: Folder of the policy, which ends in `pretrained_model`.
+        folder: Folder of the policy, whose path ends in `pretrained_model`.
 
     Returns:
         A function that decides, see `run_policy`.
@@ -375,8 +375,8 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
         """Returns the action of the trained policy for an observation, as a list of numbers.
 
         Args:
-            state: Numbers of each feature of the observation. Features with which the policy
-                was not trained are left out.
+            state: Maps each feature of the observation to its values. Features with which the
+                policy was not trained are left out.
         """
         tensors = {
             key: torch.tensor([numbers], dtype=torch.float32)
@@ -391,7 +391,7 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
 
 
 def _main() -> None:
-    """Runs a trained policy, which moves an arm of a running teleoperation session.
+    """Runs a trained policy that moves an arm of a running teleoperation session.
 
     This is the command `python -m lerobot_robot_trilat`.
     """

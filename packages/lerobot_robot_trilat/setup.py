@@ -1,6 +1,6 @@
-"""Builds this package with the version number of the main pyproject.toml.
+"""Builds this package with the version number from the main pyproject.toml.
 
-All packages of the repository have the same version, which is therefore written only once.
+All packages of the repository share one version, which is written only there.
 """
 
 import tomllib

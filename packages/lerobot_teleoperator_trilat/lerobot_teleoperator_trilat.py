@@ -1,9 +1,9 @@
 """A LeRobot teleoperator for the master that a person moves in a trilat-net session.
 
-In such a session a slave arm follows two master arms. The person moves one master, and a policy
-drives the other. An action of the person is the position of the person's arm. Feedback lets
-LeRobot move that arm, for example to the position of the policy's arm before the person
-intervenes.
+In such a session, a slave arm follows two master arms, one moved by the person and the other
+driven by a policy. An action of the person is the position of the person's arm. Through
+feedback, LeRobot can move that arm, for example to the position of the policy's arm before the
+person intervenes.
 
 Invariant:
     - The slave follows both users, weighted by their dominance factors, even while the person
@@ -32,7 +32,7 @@ _HAND_COMMANDS = {
 }
 """Commands of a hand (operator) in each mode.
 
-The values are the method of `tn.hand`, and the suffix of the keys of a command.
+Maps each mode to the method of `tn.hand` and the suffix of the keys of a command.
 """
 
 
@@ -41,20 +41,19 @@ The values are the method of `tn.hand`, and the suffix of the keys of a command.
 class TrilatTeleoperatorConfig(TeleoperatorConfig):
     """Settings of a `TrilatTeleoperator`: the session, and the sites of person and policy.
 
-    A site is an arm with its control loop. The person and the policy each hold a master arm,
-    and the slave arm follows both.
+    The person and the policy each hold a master arm, and the slave arm follows both.
 
     Attributes:
         session: Name of the session.
-        scenario: Name or path of the scenario of the session. Empty if it has the name of the
-            session.
+        scenario: Name or path of the scenario of the session. Empty if it has the same name as
+            the session.
         site: Name of the person's master.
         program: Name of the policy's master.
         slave: Name of the slave, which follows both masters.
         connect: Network endpoints of the session. Empty for the default endpoints on this
             machine.
         keys: Folder of the operator's keys. Empty for a session without keys.
-        timeout_s: Longest wait for the session, in s.
+        timeout_s: Maximum time to wait for the session, in s.
     """
 
     session: str = "play"
@@ -68,7 +67,7 @@ class TrilatTeleoperatorConfig(TeleoperatorConfig):
 
 
 class TrilatTeleoperator(Teleoperator):
-    """Teleoperator for LeRobot: the master arm that a person moves in a session of trilat-net.
+    """LeRobot teleoperator for the master arm that a person moves in a trilat-net session.
 
     LeRobot creates the object from a `TrilatTeleoperatorConfig`, and calls its methods in a
     loop.
@@ -98,13 +97,13 @@ class TrilatTeleoperator(Teleoperator):
     def action_features(self) -> dict[str, type]:
         """Keys of an action: the position of the arm in m, or angles in rad in mode `joint`.
 
-        These keys are also the position keys of the robot `TrilatRobot`.
+        The robot `TrilatRobot` uses the same keys for positions.
         """
         return dict.fromkeys(self._position_keys, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Keys of feedback: a command of the operator.
+        """Keys of feedback, which is a command of the operator.
 
         Depending on the mode in the scenario, the command is a position in m (mode `tip`),
         angles in rad (`joint`) or a force in N (`force`).
@@ -115,14 +114,14 @@ class TrilatTeleoperator(Teleoperator):
     def is_connected(self) -> bool:
         """True between `connect` and `disconnect`.
 
-        It stays true after the end of the session, because LeRobot disconnects a device only if
-        it is connected, and a device that is not disconnected keeps the process alive.
+        Stays True after the end of the session, because LeRobot disconnects a device only if it
+        is connected, and a device that is not disconnected keeps the process alive.
         """
         return self._hand is not None
 
     @property
     def is_calibrated(self) -> bool:
-        """Always True: no calibration is needed, as the scenario file describes the arm."""
+        """Always True. No calibration is needed, because the scenario describes the arm."""
         return True
 
     def calibrate(self) -> None:
@@ -137,7 +136,7 @@ class TrilatTeleoperator(Teleoperator):
         The arm is not held: only the person moves it until `enable_torque` is called.
 
         Args:
-            calibrate: Not used, because there is nothing to calibrate.
+            calibrate: Ignored, because there is nothing to calibrate.
 
         Raises:
             DeviceAlreadyConnectedError: The teleoperator is already connected.
@@ -165,7 +164,7 @@ class TrilatTeleoperator(Teleoperator):
             self._stack = stack.pop_all()
 
     def get_action(self) -> dict[str, float]:
-        """Returns the present position of the person's arm, as an action for the robot.
+        """Returns the current position of the person's arm, as an action for the robot.
 
         Returns:
             The newest position, with the keys of `action_features`.
@@ -174,7 +173,7 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(self._position_keys, position, strict=True))
 
     def get_felt(self) -> dict[str, float]:
-        """Returns the force of the arm on the person or program that holds it.
+        """Returns the force that the arm exerts on the person or program that holds it.
 
         Returns:
             The force along each axis in N, or the torque of each joint in N m in mode `joint`.
@@ -209,17 +208,17 @@ class TrilatTeleoperator(Teleoperator):
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm, so that only the person moves it, and feedback has no effect.
+        """Releases the arm, so that only the person moves it and feedback has no effect.
 
-        Calling `enable_torque` allows feedback again.
+        Call `enable_torque` to allow feedback again.
         """
         self._torque_enabled = False
         self._require_hand().release()
 
     def get_teleop_events(self) -> dict[TeleopEvents, bool]:
-        """Returns whether the person intervenes, and whether the session is over.
+        """Returns whether the person is intervening, and whether the session is over.
 
-        The events for success and for recording an episode again are never set.
+        The events for success and for re-recording an episode are never set.
         """
         hand = self._require_hand()
         shares = self._get_shares()
@@ -243,7 +242,7 @@ class TrilatTeleoperator(Teleoperator):
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the connection with which feedback moves the person's arm.
+        """Returns the connection through which feedback moves the person's arm.
 
         Raises:
             DeviceNotConnectedError: The teleoperator is not connected; call `connect` first.
@@ -254,10 +253,10 @@ class TrilatTeleoperator(Teleoperator):
 
 
 def _find_hand_mode(scenario: Any, site: str) -> str:
-    """Returns whether a program may move a site's arm by "force" or by "position".
+    """Returns the mode in which a program may move a site's arm, such as "tip" or "force".
 
-    The scenario (settings of the session) decides this in its entry for a live operator (hand),
-    whose commands come from another program.
+    The scenario determines the mode in its entry for a live operator (hand), whose commands
+    come from another program.
 
     Args:
         scenario: The scenario of the session.

@@ -63,7 +63,7 @@ def test_column_names_are_unique_with_units(which: str) -> None:
     ("live", "said"),
     [
         (False, "the age of its stamp; in virtual time"),
-        (True, "its one-way delay, by the offset of"),
+        (True, "its one-way delay, computed with"),
     ],
 )
 def test_delays_of_arrivals_state_their_kind(*, live: bool, said: str) -> None:

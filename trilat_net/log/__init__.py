@@ -1,7 +1,7 @@
-"""Writes, reads, checks and recovers logs, the files in which the messages of a run are stored.
+"""Writes, reads, checks and recovers logs, the files that hold the messages of a run.
 
-A log is a file in the format MCAP, which general viewers for robot data can open as well. For
-example, `open_log("run.mcap")["s"].q` is an array of the joint angles of the arm "s" over time.
+A log is an MCAP file, so general viewers for robot data can open it too. For example,
+`open_log("run.mcap")["s"].q` is an array of the joint angles of the arm "s" over time.
 
 Invariant:
     - No other package imports `mcap`.

@@ -1,21 +1,20 @@
-"""Counts the messages of a session: which were received, and which are missing.
+"""Counts the messages of a session: how many were received, and which are missing.
 
-The messages of a channel are numbered consecutively. A gap in the numbers therefore shows that
-a message is missing: after the numbers 1, 2 and 5, the messages 3 and 4 are missing. An
-`Account` contains these counts for one channel. The process that writes a log (the recorder)
-updates its accounts while it records, and a check of the log computes them again later.
+The messages of a channel are numbered consecutively, so a gap in the numbers reveals missing
+messages: if 1, 2 and 5 arrive, messages 3 and 4 are missing. An `Account` holds these counts
+for one channel. The recorder updates its accounts while it writes a log, and a check of the log
+later recomputes them.
 
-The results of an arm's control loop are numbered by its periods (ticks). Some numbers never had
-a message: an arm that is late skips ticks, and an arm whose process is killed and started again
-continues at a later tick. These numbers count as unpublished instead of missing.
+The records of a site are numbered by tick. Some numbers never had a message: a site that falls
+behind skips ticks, and a site that is killed and restarted continues at a later tick. These
+numbers count as unpublished rather than missing.
 
 Invariant:
     - In every account, the number of expected messages is the sum of the received and the
       missing messages.
     - Unpublished numbers are neither expected nor missing.
-    - The memory is bounded: an account stores at most `MAX_GAPS` ranges of missing numbers. If
-      there are more ranges, the lowest ranges are forgotten, but their messages still count as
-      missing.
+    - Memory is bounded: an account stores at most `MAX_GAPS` ranges of missing numbers. Beyond
+      that limit the lowest ranges are forgotten, but their messages still count as missing.
 """
 
 import math
@@ -30,13 +29,13 @@ from ..net import count_messages, number_message
 
 
 class RangeSet:
-    """Set of integers, such as the numbers of missing messages, stored as ranges.
+    """Set of integers stored as ranges, such as the numbers of missing messages.
 
-    A range is a pair of its first and its last number. The ranges are in ascending order. Thus
-    long sequences of numbers need little memory.
+    A range is a pair (first, last), both inclusive, and the ranges are in ascending order. Long
+    runs of consecutive numbers therefore need little memory.
 
     Args:
-        max_ranges: Largest number of ranges. If there are more, the lowest ones are forgotten.
+        max_ranges: Maximum number of ranges. Beyond this limit the lowest ranges are forgotten.
     """
 
     def __init__(self, max_ranges: int) -> None:
@@ -50,19 +49,19 @@ class RangeSet:
         return len(self._ranges)
 
     def _count_started(self, number: int) -> int:
-        """Returns the number of ranges whose first number is at most `number`."""
+        """Returns the number of ranges that begin at or below `number`."""
         return bisect_right(self._ranges, (number, math.inf))
 
     def insert(self, first: int, last: int) -> None:
-        """Inserts a range of consecutive numbers, none of which the set contains yet.
+        """Adds a range of consecutive numbers, none of which may already be in the set.
 
-        If a range of the set ends just before the new range, that range is extended. The new
-        range is not merged with a range that begins just after it, because this would only save
-        memory. If there are then too many ranges, the lowest ones are forgotten.
+        The new range is merged with a range that ends just before it. It is not merged with a
+        range that begins just after it, since that would only save memory. If the set then has
+        too many ranges, the lowest ones are forgotten.
 
         Args:
             first: First number of the range.
-            last: Last number of the range, which belongs to it.
+            last: Last number of the range, inclusive.
         """
         index = self._count_started(first)  # the new range belongs at this index
         if index > 0:
@@ -75,24 +74,24 @@ class RangeSet:
         self._forget_lowest()
 
     def _forget_lowest(self) -> None:
-        """Removes the ranges with the lowest numbers, if there are more than permitted.
+        """Removes the lowest ranges if there are more than the permitted number.
 
-        The memory thus stays bounded, whatever numbers a faulty or hostile sender uses (L6).
+        This bounds the memory, whatever numbers a faulty or hostile sender uses (L6).
         """
         del self._ranges[: -self._max_ranges]
 
     def remove(self, number: int, last_to_remove: int | None = None) -> bool:
-        """Removes a number, or the numbers from `number` to `last_to_remove`.
+        """Removes a number, or all numbers from `number` to `last_to_remove`.
 
-        All numbers to remove must be in one range of the set. The rest of that range is one
-        range, two ranges or nothing.
+        All numbers to remove must lie within a single range of the set. Zero, one or two ranges
+        remain of it.
 
         Args:
-            number: The number, or the first of several numbers.
-            last_to_remove: Last number to remove. If None, only `number` is removed.
+            number: The number to remove, or the first of several.
+            last_to_remove: Last number to remove, inclusive. If None, only `number` is removed.
 
         Returns:
-            False if the set does not contain `number`. Nothing is removed in this case.
+            False, with nothing removed, if `number` is not in the set.
         """
         range_with_number = self.find(number)
         if range_with_number is None:
@@ -111,14 +110,10 @@ class RangeSet:
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
-        """Returns the range of consecutive numbers that contains a number, or None.
+        """Returns the range (first, last) that contains a number, or None if no range does.
 
         Args:
-            number: The number to look for.
-
-        Returns:
-            The first and the last number of the range. None if the set does not contain the
-            number.
+            number: The number to look up.
         """
         index = self._count_started(number) - 1
         if index < 0 or number > self._ranges[index][1]:
@@ -126,16 +121,17 @@ class RangeSet:
         return self._ranges[index]
 
     def find_from(self, number: int) -> tuple[int, int] | None:
-        """Finds the first range of numbers in the set that are at or above a number.
+        """Finds the first run of consecutive numbers in the set at or above a given number.
 
-        If a range of the set contains the number, only the part from the number on is returned.
+        If the number lies inside a range, only the part of the range from that number on is
+        returned.
 
         Args:
-            number: Smallest number of interest.
+            number: Lower limit of the search.
 
         Returns:
-            The first and the last number of the range. None if all numbers of the set are
-            lower.
+            The first and last number of the run, or None if the set has no number at or above
+            the limit.
         """
         # The range that starts at or below the number may contain it. If it does not, the next
         # range is entirely above the number.
@@ -147,31 +143,30 @@ class RangeSet:
 
 
 MAX_GAPS = 50_000
-"""Largest number of gaps that an account stores. The messages of lower gaps are only counted.
+"""Maximum number of gaps that an account stores. The messages of lower gaps are only counted.
 """
 SHOWN_GAPS = 20
-"""Largest number of gaps that are listed in a text."""
+"""Maximum number of gaps listed in a message to the user."""
 
 
 class Account:
-    """Counts the messages of one channel by their numbers, and knows which are missing.
+    """Counts the messages of one channel by number, and keeps track of which are missing.
 
     Attributes:
-        received: Number of messages that were received, without repetitions.
-        duplicate: Number of messages that arrived although a message with their number had been
-            received.
+        received: Number of messages received, not counting duplicates.
+        duplicate: Number of messages that arrived although a message with the same number had
+            already been received.
         reordered: Number of messages that arrived after a message with a higher number.
-        refilled: Number of messages that were initially missing, and that the sender sent again
-            from its memory.
-        unpublished: Number of messages that were never published. The sender skipped them, or
-            was killed before it reached them and continued after them at its next start.
-        last: Largest number of a message that is known to exist. It is -1 before the first
-            message.
-        silence_ns: Longest time between two arrivals, in ns. It is 0 without arrival times.
+        refilled: Number of messages that were missing at first and that the sender then sent
+            again from its memory.
+        unpublished: Number of messages that were never published, because the sender skipped
+            them, or was killed before it reached them and continued after them when restarted.
+        last: Highest message number known to exist; -1 before the first message.
+        silence_ns: Longest time between two arrivals, in ns; 0 without arrival times.
     """
 
     def __init__(self) -> None:
-        """Starts an account of received messages with no message counted yet."""
+        """Creates an account in which no message has been counted yet."""
         self.received = 0
         self.duplicate = 0
         self.reordered = 0
@@ -194,14 +189,14 @@ class Account:
         rate_hz: int,
         absences: Sequence[tuple[int, int]],
     ) -> "Account":
-        """Counts the messages of a site in one channel of a log by their ticks.
+        """Counts the messages of a site in one channel of a log, given their ticks.
 
         Args:
-            channel: Name of the channel, of the records or of the link statistics.
-            ticks: Tick of every message, in the order of the file.
+            channel: Name of the channel that holds the records or the link statistics.
+            ticks: Tick of each message, in file order.
             rate_hz: Tick rate of the site, in Hz.
-            absences: Ticks that the site did not execute, as spans (first, last). They are not
-                missing.
+            absences: Spans (first, last) of ticks that the site did not execute. They do not
+                count as missing.
         """
         account = cls()
         for tick in ticks:
@@ -213,17 +208,17 @@ class Account:
         return account
 
     def receive(self, number: int, arrived_ns: int | None = None) -> bool:
-        """Counts a message that arrived from its sender without a request.
+        """Counts a message that arrived from its sender without having been requested.
 
-        Missing numbers between the previous messages and this one are noted as a gap.
+        Any numbers skipped since the previous message are recorded as a gap.
 
         Args:
             number: Number of the message in its channel.
-            arrived_ns: Time of the arrival on a monotonic clock, in ns. None if it is unknown.
+            arrived_ns: Arrival time on a monotonic clock, in ns. None if unknown.
 
         Returns:
-            True if the message is new. False if a message with this number had been received
-            before.
+            True if the message is new, False if a message with this number had already been
+            received.
         """
         if arrived_ns is not None:
             if self._last_arrival_ns is not None:
@@ -239,7 +234,7 @@ class Account:
         return True
 
     def refill(self, number: int) -> bool:
-        """Counts a message that the sender sent again from its memory, as requested.
+        """Counts a message that the sender sent again from its memory on request.
 
         A recorder requests missing messages. A message that arrives in this way closes its gap.
 
@@ -247,8 +242,8 @@ class Account:
             number: Number of the message in its channel.
 
         Returns:
-            True if the message is new. False if a message with this number had been received
-            before.
+            True if the message is new, False if a message with this number had already been
+            received.
         """
         is_new = self._add(number)
         self.refilled += is_new
@@ -256,32 +251,30 @@ class Account:
         return is_new
 
     def add_expected(self, published: int) -> None:
-        """Notes that the sender has published at least the messages 0 to `published` - 1.
+        """Records that the sender has published at least the messages 0 to `published` - 1.
 
-        Those that have not arrived count as missing from now on. Without this, messages missing
-        at the end would remain unnoticed, because no later number reveals the gap.
+        Those that have not arrived count as missing from now on. Messages lost at the end would
+        otherwise go unnoticed, because no later number reveals the gap.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
             self.last = published - 1
 
     def mark_unpublished(self, first: int, published: int = 0) -> int:
-        """Notes that the missing numbers just below a number never had a message.
+        """Reclassifies the missing numbers just below `first` as never published.
 
-        This happens when the sender skips numbers, or is killed and started again. The missing
-        numbers form a range that ends just below `first`. Those that are not below `published`
-        count as unpublished instead of missing.
+        This applies when the sender skips numbers, or is killed and restarted. Of the range of
+        missing numbers that ends just below `first`, those at or above `published` count as
+        unpublished instead of missing.
 
         Args:
-            first: Number of the first message after the gap. It is the first message that the
-                sender published after its next start, or after the numbers that it skipped.
-            published: Number of messages that are known to have been published before the gap.
-                These messages have the numbers below `published`, and stay missing if they were
-                not received.
+            first: Number of the first message after the gap, that is, the first one published
+                after the restart or after the skipped numbers.
+            published: Number of messages known to have been published before the gap. Their
+                numbers are below `published`, and they stay missing if they were not received.
 
         Returns:
-            The lowest number that counts as unpublished from now on. It is `first` if there is
-            no such number.
+            The lowest number that now counts as unpublished, or `first` if there is none.
         """
         self.add_expected(first)
         gap = self._gaps.find(first - 1)
@@ -296,22 +289,22 @@ class Account:
         return lowest_unpublished
 
     def mark_missing(self, first: int, last: int) -> None:
-        """Counts numbers as missing that had been counted as unpublished.
+        """Reclassifies numbers that had counted as unpublished as missing.
 
-        This is necessary when another site reports that messages with these numbers existed.
+        Needed when another site reports that messages with these numbers existed.
 
         Args:
             first: First number of the range.
-            last: Last number of the range, which belongs to it.
+            last: Last number of the range, inclusive.
         """
         self._gaps.insert(first, last)
         self.unpublished -= last + 1 - first
 
     def abandon_below(self, number: int) -> None:
-        """Gives up the missing messages below a number, which no process can send any more.
+        """Gives up on missing messages below a number, which no process can resend.
 
-        They are no longer requested, but still count as missing. Such a message still counts as
-        received if it arrives.
+        They are no longer requested but still count as missing. If such a message arrives after
+        all, it counts as received.
 
         Args:
             number: First number that is not affected.
@@ -319,63 +312,60 @@ class Account:
         self._abandoned_below = max(self._abandoned_below, number)
 
     def find_requestable_gap(self, number: int = 0) -> tuple[int, int] | None:
-        """Finds the first missing messages that can still be requested from the sender.
+        """Finds the first gap whose messages can still be requested from the sender.
 
-        Messages that no member (process of a session) has any more are left out, so that they
-        are not requested repeatedly.
+        Messages that no member of the session holds any more are skipped, so they are not
+        requested over and over.
 
         Args:
-            number: Smallest number to consider.
+            number: Lowest message number to consider.
 
         Returns:
-            The first and the last number of the gap. None if no message can be requested.
+            The first and last number of the gap, or None if there is nothing left to request.
         """
         return self._gaps.find_from(max(number, self._abandoned_below))
 
     @property
     def expected(self) -> int:
-        """Number of messages that a process has published, as far as a receiver knows.
+        """Number of messages that the sender has published, as far as the receiver knows.
 
-        Skipped numbers that never had a message (`unpublished`) are not counted.
+        Numbers that never had a message (`unpublished`) are excluded.
         """
         return self.last + 1 - self.unpublished
 
     @property
     def missing(self) -> int:
-        """Number of lost messages: those that were published but never received."""
+        """Number of lost messages, that is, messages that were published but never received."""
         return self.expected - self.received
 
     @property
     def gaps(self) -> list[list[int]]:
-        """Numbers of the messages that are missing, as pairs [first, last] in ascending order.
+        """Ranges of missing message numbers, as pairs [first, last] in ascending order.
 
-        The value is [[10, 12]], for example, if the messages 10, 11 and 12 are missing. At most
-        `MAX_GAPS` pairs with the highest numbers are included.
+        For example, [[10, 12]] if messages 10, 11 and 12 are missing. At most `MAX_GAPS` ranges
+        are stored, namely those with the highest numbers.
         """
         return [list(gap) for gap in self._gaps]
 
     @property
     def largest_gap(self) -> int:
-        """Number of messages in the longest series of missing messages. 0 if there are none.
+        """Length of the longest run of consecutive missing messages; 0 if none is missing.
 
-        A long series indicates an interruption, while the same number of single losses may be
+        A long run indicates an interruption, whereas the same number of isolated losses may be
         harmless.
         """
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
     def describe(self, *before: "Account") -> str:
-        """Describes the account of a channel in one line, as a log stores it for each channel.
+        """Summarises the account in one line, as a log stores it for each channel.
 
-        The line contains the numbers of expected, received and missing messages, and the first
-        ranges of missing numbers.
+        The line states the expected, received and missing counts and the first ranges of
+        missing numbers. `parse_counts` can read it back.
 
         Args:
-            *before: Accounts of earlier starts of the sender, which numbered their messages
-                from 0 as well. Their counts are added to those of this account. Missing ranges
-                are listed for the last start only.
-
-        Returns:
-            The line, which `parse_counts` can read.
+            *before: Accounts of earlier starts of the sender, each numbered from 0. Their
+                counts are added to those of this account. Missing ranges are listed for the
+                last start only.
         """
         starts = (*before, self)
         counts = []
@@ -399,16 +389,16 @@ class Account:
 
     @staticmethod
     def parse_counts(account: str) -> dict[str, int]:
-        """Reads the numbers of received and missing messages from a line of `describe`.
+        """Parses the received and missing counts from a line written by `describe`.
 
-        A finished log stores the counts as such lines, for people and for programs.
+        A finished log stores its counts as such lines, readable by people and programs alike.
 
         Args:
-            account: The line, as a log stores it for each topic.
+            account: The line that a log stores for a topic.
 
         Returns:
-            The numbers, under the keys "received" and "missing". Empty if the text is not such
-            a line.
+            The counts under the keys "received" and "missing". Empty if the line has another
+            format.
         """
         matches = re.findall(r"(received|missing) (\d{1,15})\b", account)
         return {name: int(digits) for name, digits in matches}
@@ -416,27 +406,26 @@ class Account:
     def format_gaps(self, most: int, base: int = 0) -> list[str]:
         """Formats the first ranges of missing numbers for a message to the user.
 
-        The result is, for example, ["10-12", "40-40"] if the numbers 10 to 12 and 40 are
-        missing.
+        For example, ["10-12", "40-40"] if messages 10 to 12 and 40 are missing.
 
         Args:
-            most: Largest number of ranges to return.
-            base: Number that is added to all numbers, if the account does not count from the
-                first message of the session.
+            most: Maximum number of ranges to return.
+            base: Offset added to every number, if the account does not count from the first
+                message of the session.
 
         Returns:
-            A string "first-last" for each range. Empty if no message is missing.
+            One "first-last" string per range. Empty if no message is missing.
         """
         gaps = islice(self._gaps, most)
         return [f"{base + first}-{base + last}" for first, last in gaps]
 
     def _add(self, number: int) -> bool:
-        """Marks the number of a message as received.
+        """Marks a message number as received.
 
-        It is removed from the missing numbers, or extends the known numbers.
+        The number is removed from the missing numbers, or extends the range of known numbers.
 
         Returns:
-            False if the number had been marked as received before.
+            False if the number had already been marked as received.
         """
         if number > self.last:
             self.add_expected(number)
@@ -446,15 +435,14 @@ class Account:
 
 
 class StartGap:
-    """Gap between the messages of two starts of a site (arm controller), in one channel.
+    """Gap between the messages of two starts of a site, in one channel.
 
-    A site that is killed cannot state how many messages it published. After its next start it
-    continues at a later tick (control period). The messages in between were either published
-    and lost on the way to the recorder, or never published. Other sites may have received
-    samples of the earlier start. In that case these sites know a lower limit of the number of
-    messages that the earlier start published. Their reports may arrive before or after the next
-    start. A few messages were still in transit to the recorder when the site was killed. These
-    count as unpublished.
+    A site that is killed cannot state how many messages it published, and when restarted it
+    continues at a later tick. The messages in between were either published and lost on the way
+    to the recorder, or never published. Other sites that received samples of the earlier start
+    know a lower bound on the number of messages it published, and may report that bound before
+    or after the restart. A few messages may still have been in transit to the recorder when the
+    site was killed. These count as unpublished.
 
     The gap is divided at the number `_first_unpublished`, which never decreases:
 
@@ -466,13 +454,13 @@ class StartGap:
 
     Args:
         account: Account of the channel.
-        under_way: Largest number of messages that may have been in transit.
+        under_way: Maximum number of messages that may have been in transit.
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
-        """Stores the account of a site's messages before the site was started again.
+        """Stores the account of a site's messages before the site was restarted.
 
-        The number of messages that were lost between both starts is initially unknown.
+        The number of messages lost between the two starts is unknown at first.
         """
         self._account = account
         self._under_way = under_way
@@ -487,18 +475,17 @@ class StartGap:
         self._next_first = -1
 
     def begin_next_start(self, first: int, published: int) -> None:
-        """Evaluates the gap before the next start of the site, once that start is known.
+        """Evaluates the gap before the next start of a killed site, once that start is known.
 
-        The site (arm controller) was killed and has been started again. The missing messages
-        just before the next start now count as unpublished in the account, except the messages
-        that the site itself is known to have published. Reports of other sites that arrived
-        earlier are then evaluated. Some of these numbers may then count as missing again. Only
-        the first call has an effect.
+        The missing messages just before the next start are reclassified as unpublished, except
+        those that the site itself is known to have published. Reports that other sites sent
+        earlier are then evaluated, which may turn some of these numbers back into missing ones.
+        Only the first call has an effect.
 
         Args:
-            first: Number of the first message that belongs to the next start.
-            published: Number of messages that the earlier start itself stated when it ended. It
-                is 0 if the site was killed before it could state the number.
+            first: Number of the first message of the next start.
+            published: Number of messages that the earlier start stated when it ended; 0 if the
+                site was killed before it could state the number.
         """
         is_evaluated = self._next_first >= 0
         if is_evaluated:
@@ -509,21 +496,20 @@ class StartGap:
         self.note_published(self._reported)
 
     def note_published(self, published: int) -> None:
-        """Updates the gap with the number of messages that the killed site had published.
+        """Updates the gap after a report of how many messages the killed site had published.
 
-        Other sites (arm controllers) report this number, because they received samples, the
-        states that a site sends. Missing messages before the next start first count as
-        unpublished, because they may have been in transit when the site was killed. If the
-        reported number shows that more messages were lost than can have been in transit, all
-        lost messages count as missing instead: the numbers from `_first_unpublished` to below
-        the reported number.
+        Other sites send these reports, because they received samples of the killed site. The
+        missing messages before the next start first count as unpublished, since they may have
+        been in transit when the site was killed. If a report shows that more messages were lost
+        than can have been in transit, all of them (from `_first_unpublished` up to, but
+        excluding, the reported number) count as missing instead.
 
-        Before the next start is known, the report is only stored. `begin_next_start` evaluates
-        it later.
+        Before the next start is known, the report is only stored for `begin_next_start` to
+        evaluate.
 
         Args:
-            published: Lower limit of the number of messages that the site published. These
-                messages have the numbers below it.
+            published: Lower bound on the number of messages that the site published. Their
+                numbers are below it.
         """
         self._reported = max(self._reported, published)
         # Messages of the next start do not belong to the gap.
@@ -538,11 +524,10 @@ class StartGap:
 
 
 def describe_unknown_ends(sites: Sequence[str]) -> str:
-    """Returns a sentence for the user about sites whose end is unknown.
+    """Returns a sentence that warns the user about sites whose end is unknown.
 
-    A site (arm controller) publishes an "end" event when it ends. Without this event, nobody
-    knows whether the site published further records (results of control periods) after the last
-    record that was received.
+    A site publishes an "end" event when it ends. Without this event, it is unknown whether the
+    site published any more records after the last one received.
 
     Args:
         sites: Names of the sites whose "end" event was not received, at least one.
@@ -554,17 +539,16 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
 
 
 MIN_COVERAGE = 0.999
-"""Default of the smallest fraction of every site's ticks that must be judged."""
+"""Default for the smallest fraction of each site's ticks that must be judged."""
 
 
 class Coverage(NamedTuple):
-    """Part of a run that was recorded, or checked by a tool, for each site.
-
-    A site is a process that runs one arm. A tick is one period of its control loop.
+    """How much of a run was recorded, or checked by a tool, per site.
 
     Attributes:
-        judged: Number of recorded or checked ticks, by name of the site.
-        expected: Number of all ticks of the site in the run, by name of the site.
+        judged: Maps the name of each site to the number of its ticks that were recorded or
+            checked.
+        expected: Maps the name of each site to the number of all its ticks in the run.
     """
 
     judged: dict[str, int]
@@ -572,18 +556,17 @@ class Coverage(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Smallest fraction of control periods of any site that were recorded, from 0 to 1.
+        """Fraction of ticks that were recorded or checked at the worst site, from 0 to 1.
 
-        A run is known only as well as its worst site (arm controller). In the result of a
-        check, the fraction is that of checked periods. It is 0 if no site has any periods. A
-        single site without periods does not reduce it.
+        A run is only as well known as its worst site. The fraction is 0 if no site has any
+        ticks, but one site with no ticks does not lower it.
         """
         if not any(self.expected.values()):
             return 0.0
         return min(map(self._share, self.expected), default=0.0)
 
     def _share(self, site: str) -> float:
-        """Returns the fraction of judged ticks of a site. It is 1 for a site without ticks."""
+        """Returns the fraction of a site's ticks that were judged (1 if it has no ticks)."""
         expected = self.expected[site]
         if not expected:
             return 1.0
@@ -605,21 +588,17 @@ class Coverage(NamedTuple):
         """Describes for the user how much of the run was recorded or checked.
 
         Args:
-            least: Smallest fraction of ticks (control periods) that is sufficient, from 0 to 1.
-                The text mentions it if the actual fraction is smaller.
-
-        Returns:
-            The text for the user.
+            least: Smallest sufficient fraction of ticks, from 0 to 1. Mentioned in the
+                description if the actual fraction is smaller.
         """
         shortage = f", less than {_format_percent(least)}" if self.share < least else ""
         return f"judged {self}{shortage}"
 
     def to_json(self) -> dict[str, list[int]]:
-        """Returns how many control periods of each site were recorded or checked, for JSON.
+        """Returns, per site, how many ticks were recorded or checked, for output as JSON.
 
         Returns:
-            For each site the pair [recorded or checked ticks, all ticks]. A tick is one period
-            of the control loop of the site.
+            Maps the name of each site to the pair [recorded or checked ticks, all ticks].
         """
         return {
             site: [self.judged.get(site, 0), ticks] for site, ticks in self.expected.items()
@@ -627,11 +606,11 @@ class Coverage(NamedTuple):
 
 
 def _format_percent(share: float) -> str:
-    """Formats a fraction as a percentage, rounded down so that only a full share is 100 %."""
+    """Formats a fraction as a percentage, rounded down so that only 1 is shown as 100 %."""
     return f"{math.floor(1e5 * share) / 1e3:g} %"
 
 
 LAST = "last"
 """Kind of the event in which a site states how many ticks of a peer it had received before the
-peer was started again.
+peer was restarted.
 """

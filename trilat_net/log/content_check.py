@@ -1,24 +1,23 @@
-"""Decides by the content of a message without a checksum whether the message is genuine.
+"""Decides from the content of a message without a checksum whether the message is genuine.
 
 A log stores messages in compressed chunks, each with a checksum. If a recording was
-interrupted, for example by a power failure, the checksum of the last chunk is missing. The
-recovery of the log should still use the messages of this chunk. A log states the identity of
-each message in four ways: by its position in the file, by its channel, by its sequence number,
-and in the message itself. If all four agree, damage can only have changed numbers inside that
-one message.
+interrupted, for example by a power failure, the last chunk has no checksum, but the recovery of
+the log should still use its messages. A log identifies each message in four ways: by its
+position in the file, by its channel, by its sequence number, and by the content of the message
+itself. If all four agree, damage can only have changed values inside that one message.
 
 Invariant:
     - An accepted message can be decoded with the schema of its channel. It comes from the
-      sender to whom the channel belongs, and from the same start of that sender's process as
-      the previous message.
-    - It has the next number of its channel, and is stored with that number and its sending
-      time.
-    - Its arrival time is within the time range that its chunk states, and not before the
+      sender that owns the channel, and from the same start of that sender's process as the
+      previous message.
+    - Its number is the next one in its channel, and the file stores it with that number and
+      with its sending time.
+    - Its arrival time lies within the time range stated by its chunk, and not before the
       arrival of the previous message.
-    - After the first message that fails, no message is accepted.
+    - After the first message that fails, no further message is accepted.
     - In virtual time (a simulation without clocks), the scenario determines the random number
-      that identifies the start of each arm's process. Therefore a chunk of a run with another
-      scenario or seed is refused, even if a checksum covers it.
+      that identifies each start of a process. A chunk from a run with another scenario or seed
+      is therefore rejected, even if a checksum covers it.
 """
 
 import re
@@ -36,12 +35,12 @@ from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_re
 from .message_identity import AnyMessage, MessageIdentity, compute_virtual_boot
 
 _CDR_HEAD = b"\x00\x01"
-"""First bytes of a message that was written for viewers, in the encoding of ROS 2."""
+"""First bytes of a message for viewers, in the encoding of ROS 2."""
 
 _VIRTUAL_DRIVER = "virtual"
 """Value of the metadata `driver` for a session in virtual time."""
 _SAMPLED_MESSAGES = 200
-"""Number of messages of a chunk that are decoded to find their origins."""
+"""Number of messages of a chunk that are decoded to find out where they come from."""
 _CHECKED_MESSAGES = 20
 """Number of messages of a chunk whose boots are compared with those of the scenario."""
 
@@ -49,11 +48,11 @@ _CHECKED_MESSAGES = 20
 class MessageOrigins(NamedTuple):
     """Sessions and senders from which a set of messages comes.
 
-    A log has messages of a single session. Messages of further sessions show that the file
+    All messages of a log belong to one session. Messages of other sessions show that the file
     contains parts of another file.
 
     Attributes:
-        epochs_ns: Start times of the sessions, in Unix time, in ns.
+        epochs_ns: Start times of the sessions in Unix time, in ns.
         boots: Pairs of a sender and the number that identifies its start.
     """
 
@@ -62,23 +61,22 @@ class MessageOrigins(NamedTuple):
 
     @classmethod
     def find(cls, data: bytes, most: int = _SAMPLED_MESSAGES) -> "MessageOrigins":
-        """Determines the sessions and senders of the first messages of a chunk.
+        """Determines which sessions and senders the first messages of a chunk come from.
 
-        A damaged file may contain a chunk, a block of messages, of another file. Two facts
-        reveal such a chunk: the start time (epoch) of the session, and the boots of the
-        senders, random numbers that identify the starts of their processes. A message shows the
-        epoch in one of two ways:
+        A damaged file may contain a chunk of another file. Two things reveal such a chunk: the
+        start time (epoch) of the session, and the boots of the senders, which are random
+        numbers that identify each start of a process. A message reveals the epoch in one of two
+        ways:
 
         - An event that announces the start of a session states the epoch.
-        - A record (result of one period of a control loop) or statistics message states its
-          sending time after the epoch, and is stored with its sending time in Unix time. The
-          difference is the epoch.
+        - A record or statistics message states its sending time relative to the epoch, and is
+          stored with its sending time in Unix time. The difference is the epoch.
 
-        Sessions in virtual time start at 0.
+        In virtual time, sessions start at 0.
 
         Args:
-            data: The unpacked chunk.
-            most: Largest number of messages to decode.
+            data: The uncompressed chunk.
+            most: Maximum number of messages to decode.
 
         Returns:
             The start times and the senders. Empty if no message can be decoded.
@@ -115,19 +113,18 @@ class MessageOrigins(NamedTuple):
         return cls(epochs_ns, boots)
 
     def are_foreign(self, about: Mapping[str, str]) -> bool:
-        """Determines whether the messages come from another simulated run than a log.
+        """Returns True if the messages come from a simulated run other than that of a log.
 
-        In a simulated run, which has virtual time, each process has a number (boot) that is
-        computed from the scenario, the description of the experiment. The numbers therefore
-        show to which run a message belongs. In a live session, the numbers are random and show
-        nothing.
+        In a simulated run, which uses virtual time, the number that identifies each process
+        (its boot) is computed from the scenario. The boots therefore show which run a message
+        belongs to. In a live session they are random and show nothing.
 
         Args:
-            about: Metadata of the session in the log.
+            about: Session metadata of the log.
 
         Returns:
-            True if no boot agrees with the scenario of the log. False if a boot agrees, if
-            there are no messages, or if the log is from a live session.
+            True if no boot matches the scenario of the log. False if a boot matches, if there
+            are no messages, or if the log is from a live session.
         """
         if about.get("driver") != _VIRTUAL_DRIVER:
             return False
@@ -137,22 +134,22 @@ class MessageOrigins(NamedTuple):
 
 
 class ContentCheck:
-    """Checks a session's messages against its scenario, its metadata and its earlier messages.
+    """Checks the messages of a session against its scenario, metadata and earlier messages.
 
-    The recovery passes the messages in the order of the file: messages with a valid checksum to
-    `accept`, all others to `check`.
+    The recovery passes the messages in file order: those with a valid checksum to `accept`, all
+    others to `check`.
 
     Args:
         scenario: Scenario of the session.
-        about: Metadata of the session.
-        is_continued: True for a later part of a log, in which the numbers of the messages do
-            not start at 0.
+        about: Session metadata.
+        is_continued: True for a later part of a log, in which the message numbers do not start
+            at 0.
     """
 
     def __init__(
         self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool
     ) -> None:
-        """Prepares the check of a channel's messages. No message has been accepted yet."""
+        """Prepares the check of a session's messages. No message has been accepted yet."""
         self._scenario = scenario
         self._about = about
         self._session = about.get("session", "")
@@ -165,25 +162,24 @@ class ContentCheck:
         self._log_ns = 0
 
     def accept(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
-        """Stores a message that a checksum covers, for the check of the next message.
+        """Stores a message covered by a checksum, for comparison with the next message.
 
-        The numbers and times of the messages in a channel increase. A trusted message therefore
-        limits the number and the times of its successor.
+        Message numbers and times increase within a channel, so a trusted message limits the
+        number and times of its successor.
 
         Args:
             topic: Topic of the channel.
             sequence: Sequence number that the file stores with the message.
-            log_ns: Arrival time, in Unix time, in ns.
+            log_ns: Arrival time in Unix time, in ns.
             payload: Bytes of the message.
         """
         self._latest[topic] = sequence, payload
         self._log_ns = max(self._log_ns, log_ns)
 
     def owns_channel(self, topic: str) -> bool:
-        """Returns True if a topic belongs to a member of this session.
+        """Returns True if a topic belongs to a member of this session (a site or the recorder).
 
-        A member is a process of the session: a site or the recorder. A damaged file may contain
-        parts of another log, whose topics name another session.
+        A damaged file may contain parts of another log, whose topics name another session.
 
         Args:
             topic: Topic of a channel, such as "/trilat/paper/m1/state".
@@ -204,8 +200,8 @@ class ContentCheck:
             payload: Bytes of the message.
 
         Returns:
-            The topic. Empty if the message cannot be decoded, or is not from a member of the
-            session.
+            The topic. Empty if the message cannot be decoded, or was not sent by a member of
+            the session.
         """
         kinds: tuple[Any, ...] = tuple(CHANNEL_TYPES.values())
         for kind in kinds:
@@ -219,9 +215,9 @@ class ContentCheck:
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
-        """Returns the description of a channel that a correct log of the session contains.
+        """Returns the description of a channel as a correct log of the session contains it.
 
-        A recovery uses it to restore a lost description.
+        A recovery uses it to restore a description that was lost.
 
         Args:
             topic: Topic of the channel.
@@ -241,16 +237,16 @@ class ContentCheck:
         payload: bytes,
         span_ns: tuple[int, int],
     ) -> None:
-        """Checks by its content that a message is the next one of its channel.
+        """Raises UnreadableRecord unless a message is provably the next of its channel.
 
-        This is needed for messages that no checksum covers. If the message is the next one, it
-        is noted like a message that `accept` receives.
+        Used for messages that no checksum covers. A message that passes is stored for later
+        comparison, as `accept` does.
 
         Args:
             topic: Topic of the channel.
             sequence: Sequence number that the file stores with the message.
-            log_ns: Arrival time, in Unix time, in ns.
-            publish_ns: Sending time, in Unix time, in ns.
+            log_ns: Arrival time in Unix time, in ns.
+            publish_ns: Sending time in Unix time, in ns.
             payload: Bytes of the message.
             span_ns: First and last arrival time of the chunk that contains the message, in Unix
                 time, in ns.
@@ -277,10 +273,10 @@ class ContentCheck:
         self.accept(topic, sequence, log_ns, payload)
 
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
-        """Decodes a message, and returns it with the identity that its content states.
+        """Decodes a message and determines the identity stated by its content.
 
         The identity consists of sender, channel, number and sending time. It is compared with
-        the place of the message in the file.
+        the position of the message in the file.
 
         Args:
             topic: Topic of the message.
@@ -305,7 +301,7 @@ class ContentCheck:
     def _check_session_message(
         self, topic: str, sequence: int, publish_ns: int, payload: bytes
     ) -> None:
-        """Checks that a message from a process of the session is the next one of its channel.
+        """Raises UnreadableRecord unless a member's message is the next one of its channel.
 
         A damaged file may contain messages of other sessions, which must not be copied.
 
@@ -348,17 +344,17 @@ class ContentCheck:
                 )
 
     def check_origin(self, data: bytes) -> None:
-        """Checks that a block of messages (chunk) does not come from another simulated run.
+        """Raises UnreadableRecord if a chunk of messages comes from another simulated run.
 
-        A damaged file may contain blocks of another file. Only the first messages of the chunk
-        are examined. In a live session nothing is checked, because its messages do not show the
-        run.
+        A damaged file may contain chunks of another file. Only the first messages of the chunk
+        are examined. For a live session nothing is checked, because its messages do not
+        identify the run.
 
         Args:
-            data: The unpacked chunk.
+            data: The uncompressed chunk.
 
         Raises:
-            UnreadableRecord: No examined message comes from the run of this log.
+            UnreadableRecord: None of the examined messages comes from the run of this log.
         """
         # Decoding messages is slow, and the boots of live sessions prove nothing.
         if self._about.get("driver") != _VIRTUAL_DRIVER:
@@ -368,11 +364,11 @@ class ContentCheck:
             raise UnreadableRecord("a chunk belongs to another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the number that identifies the present start of a process, or None.
+        """Returns the number that identifies the current start of a process, or None.
 
         All messages of one start contain this number (boot). In virtual time, it is computed
-        from the scenario. Otherwise it is read from the latest accepted message. The result is
-        None if there is no such message.
+        from the scenario. Otherwise it is read from the latest accepted message, and None is
+        returned if there is no such message.
         """
         if self._about.get("driver") == _VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
@@ -386,7 +382,7 @@ class ContentCheck:
         return None
 
     def _check_number(self, topic: str, message: AnyMessage, number: int) -> None:
-        """Checks that a message has the next number of its channel, and is not a repetition.
+        """Raises UnreadableRecord unless a message has the next number of its channel.
 
         Args:
             topic: Topic of the channel.
@@ -414,21 +410,21 @@ class ContentCheck:
             expected += count_skipped_ticks(message.cmd)
         if number != expected:
             raise UnreadableRecord(
-                f"message {number} of {topic} stands where message {expected} was expected"
+                f"message {number} of {topic} was found where message {expected} was expected"
             )
 
     def _check_tick(self, topic: str, record: State) -> None:
-        """Checks that the content of a record is possible in a run of the scenario.
+        """Raises UnreadableRecord if a record is impossible in a run of the scenario.
 
-        The tick (control period) must exist and have its nominal time, the peers (other sites)
-        must exist, and the mode must be known.
+        The tick must exist and have its nominal time, the peers must exist, and the mode must
+        be known.
 
         Args:
             topic: Topic of the record, for the error message.
             record: The record.
 
         Raises:
-            UnreadableRecord: The content is not possible.
+            UnreadableRecord: The content is impossible.
         """
         site = record.site
         ticks = self._scenario.ticks(site)

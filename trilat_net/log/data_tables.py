@@ -1,19 +1,18 @@
-"""Converts a log to tables of numbers, which are exported to CSV, Parquet and data frames.
+"""Converts a log to tables that can be exported to CSV, Parquet and data frames.
 
-There are four kinds of tables for an arm or a run: the states of an arm (a row for each period
-of its control loop), the states that it received from other arms, the statistics of its network
-connections, and the events of the run. For example, a column of the first kind is `q1_rad`, the
-angle of joint 1.
+There are four kinds of tables: the states of an arm (one row per tick), the states that it
+received from other arms, the statistics of its network links, and the events of the run. For
+example, the column `q1_rad` of the first kind is the angle of joint 1 in rad.
 
 Invariant:
-    - Every number is taken from the log, or follows exactly from numbers of the log (an age is
-      a difference between time stamps). The only exceptions are orientations, which the table
-      contains as unit quaternions that do not jump (see `orientations`).
+    - Every value is taken from the log, or follows exactly from values in the log (an age is a
+      difference of two time stamps). The only exceptions are orientations, which are given as
+      unit quaternions that do not jump (see `orientations`).
     - The name of a column ends in its unit. A missing value is null, never a number.
     - Units, names and meanings come from the message types and from the declarations of control
-      laws. Thus nothing is described in two places.
-    - A number that is out of range, or a state from an arm that the receiver does not follow,
-      raises a `LogError` that names the file.
+      laws, so nothing is described in two places.
+    - A number out of range, or a state from an arm that the receiver does not follow, raises a
+      `LogError` that names the file.
 """
 
 import dataclasses
@@ -55,42 +54,43 @@ UNIT_SUFFIXES = {
     "ns/s": "ppb",
     "byte": "bytes",
 }
-"""Last part of a column's name, by unit."""
+"""Maps each unit to the last part of a column's name."""
 EVENTS_TABLE = "events"
 """Name of the table with the events."""
 SITE_TABLE_KINDS = ("state", "link", "arrivals")
-"""Kinds of tables that each site has."""
+"""Kinds of tables available for each site."""
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
-"""Fields of the statistics in which -1 means that there is no value."""
+"""Fields of the statistics in which -1 represents a missing value."""
 _JOINT_VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x")
-"""Vectors of a record with a number per joint, if the sites share joint positions."""
+"""Vectors of a record with one entry per joint, if the sites share joint positions."""
 _TASK_VECTORS = {
     **dict.fromkeys(("q_des", "x"), ("m", "rad")),
     **dict.fromkeys(("qd_des", "xd"), ("m/s", "rad/s")),
     "wrench": ("N", "N m"),
 }
-"""Vectors of a record with a number per coordinate of the end effector, if the sites share
-its position or pose. The units are those of the three position coordinates and of the others.
+"""Vectors of a record with one entry per coordinate of the end effector, if the sites share its
+position or pose. The first unit is that of the three position coordinates, the second that of
+the others.
 """
 
 
 _POSES = ("q_des", "x")
-"""Vectors of `_TASK_VECTORS` that contain an orientation. The other ones contain an angular
+"""Vectors in `_TASK_VECTORS` that contain an orientation. The others contain an angular
 velocity or a torque.
 """
-_STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one before"
-"""Part of the meaning of orientation columns."""
+_STEADY_QUATERNION = "a unit quaternion w, x, y, z, with signs that avoid jumps"
+"""Text that is part of the meaning of orientation columns."""
 
 
 class Column(NamedTuple):
-    """One column of a table that is exported from a log, with K rows.
+    """One column of a table exported from a log, with K rows.
 
     Attributes:
         name: Name of the column, which ends in its unit, such as "t_s".
-        values: The values, shape (K,): numbers, or texts as objects.
-        unit: Unit of the values. Empty for texts and counts.
-        meaning: Description of the values for the reader of the table.
-        source: Field of the message from which the values are taken.
+        values: The values, shape (K,): numbers, or strings as objects.
+        unit: Unit of the values. Empty for strings and counts.
+        meaning: Description of the values for readers of the table.
+        source: Message field that the values are taken from.
         known: True for the rows that have a value, shape (K,). None if all rows have one.
     """
 
@@ -103,35 +103,34 @@ class Column(NamedTuple):
 
     @property
     def is_text(self) -> bool:
-        """True if the values of the column are strings, and False if they are numbers."""
+        """True if the column holds strings, False if it holds numbers."""
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a numeric column as an array, with NaN for missing values.
+        """Returns a numeric column as an array of shape (K,), with NaN for missing values.
 
-        The shape is (K,). Exports to formats without missing values, such as NumPy files, use
-        this array.
+        Used for export to formats that cannot represent missing values, such as NumPy files.
         """
         if self.known is None or self.known.all():
             return self.values
         return np.where(self.known, self.values, np.nan)
 
     def texts(self) -> NDArray[Any]:
-        """Returns the values of a column of texts as NumPy strings, shape (K,).
+        """Returns a string column as an array of NumPy strings, shape (K,).
 
-        Formats for numbers, such as .npz, store texts in this way.
+        Array formats such as .npz store strings in this form.
         """
         return np.array(self.values.tolist(), dtype=np.str_)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns some consecutive values of the column as plain Python values, as for CSV.
+        """Returns a slice of the column as plain Python values, as needed for CSV.
 
         Args:
             first: Index of the first row.
             last: Index after the last row.
 
         Returns:
-            The values. None for a row without a value.
+            The values, with None for rows without a value.
         """
         values: list[Any] = self.values[first:last].tolist()
         if self.known is None:
@@ -144,14 +143,14 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table that is exported from a log, such as the joint angles of an arm over time.
+    """A table exported from a log, such as the joint angles of an arm over time.
 
-    All its columns have the same length.
+    All columns have the same length.
 
     Attributes:
-        name: Name of the site (arm controller) whose messages the table contains, or "events".
+        name: Name of the site whose messages the table contains, or "events".
         kind: Kind of a site's table, one of `SITE_TABLE_KINDS`. Empty for other tables.
-        about: Description of a row for the reader of the table.
+        about: Explains to readers of the table what one row contains.
         columns: The columns.
     """
 
@@ -164,7 +163,7 @@ class Table:
         return len(self.columns[0].values) if self.columns else 0
 
     def __getitem__(self, name: str) -> Column:
-        """Returns a column of the table by its name, as in `table["q1_rad"]`.
+        """Returns the column with a given name, as in `table["q1_rad"]`.
 
         Raises:
             KeyError: The table has no column of that name.
@@ -176,16 +175,16 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Name of the table for file names, such as "m1_link" for the links of the site "m1".
+        """Name of the table for file names, such as "m1_link" for the links of site "m1".
 
-        A table about all sites has a name without a site, such as "events".
+        The name of a table about all sites contains no site, for example "events".
         """
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
     def to_data_frame(self) -> "polars.DataFrame":
-        """Converts a table of a log to a polars data frame with the same columns.
+        """Converts the table to a polars data frame with the same columns.
 
-        A missing value becomes null.
+        Missing values become null.
 
         Raises:
             UsageError: polars is not installed.
@@ -204,9 +203,9 @@ class Table:
         return cast("polars.DataFrame", pl.DataFrame(all_series))
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """Converts a table of a log to a pandas data frame with the same columns.
+        """Converts the table to a pandas data frame with the same columns.
 
-        Missing values become None in a column of texts, and NaN in a column of numbers.
+        Missing values become None in string columns and NaN in numeric columns.
 
         Raises:
             UsageError: pandas is not installed.
@@ -221,14 +220,14 @@ class Table:
 
     @classmethod
     def of_states(cls, site: SiteLog, scenario: Scenario) -> "Table":
-        """Creates a table of an arm's angles, torques and other values, a row per tick.
+        """Creates a table of an arm's angles, torques and other values, one row per tick.
 
         Args:
-            site: Records (results of control periods) of the site (arm controller).
+            site: Records of the site.
             scenario: Scenario of the session, which names the joints and parameters.
 
         Returns:
-            The table, in the order of the ticks.
+            The table, in tick order.
         """
         docs = read_field_docs(State)
         arm = scenario.arms[site.name]
@@ -267,19 +266,18 @@ class Table:
 
     @classmethod
     def of_arrivals(cls, site: SiteLog, source: str, *, live: bool) -> "Table":
-        """Creates a table of the messages that a site received, with their delays.
+        """Creates a table of the samples that a site received, with their delays.
 
-        A message (sample) is the state that a peer, another site (arm controller), publishes in
-        one tick (control period). The table has one row per message, in the order of arrival.
+        The table has one row per sample, in order of arrival.
 
         Args:
             site: Records of the receiving site, which list the arrivals.
             source: Name of the file for error messages.
-            live: True if the session was live. The delays were then measured. In virtual time
-                the delays are the ages of the samples.
+            live: True if the session was live, in which case the delays were measured. In
+                virtual time the delays are the ages of the samples.
 
         Raises:
-            LogError: A record contains an arrival from a peer that the site does not have.
+            LogError: A record lists an arrival from a peer that the site does not have.
         """
         counts, entries = site.arrivals
         index = entries[:, 0]
@@ -293,7 +291,7 @@ class Table:
         names = np.array(site.peers, dtype=np.object_)[index]
         delay = "the age of its stamp; in virtual time every sample arrives at the next tick"
         if live:
-            delay = "its one-way delay, by the offset of the clocks in force"
+            delay = "its one-way delay, computed with the clock offset in use"
         columns = (
             *_make_time_columns(
                 site.tick[row], site.t_s[row], site.log_time_ns[row], site.publish_time_ns[row]
@@ -302,14 +300,14 @@ class Table:
                 name="peer",
                 values=names,
                 unit="",
-                meaning="whose sample came",
+                meaning="peer that sent the sample",
                 source="rx[][0]",
             ),
             Column(
                 name="sample_tick",
                 values=entries[:, 1].copy(),
                 unit="tick",
-                meaning="its tick, at the peer's rate",
+                meaning="tick of the sample, at the peer's rate",
                 source="rx[][1]",
             ),
             Column(
@@ -323,7 +321,7 @@ class Table:
         return cls(
             site.name,
             "arrivals",
-            f"a sample that {site.name} took in, by the tick that did",
+            f"a sample that {site.name} received, with the tick that took it in",
             columns,
         )
 
@@ -331,17 +329,17 @@ class Table:
     def of_link_stats(
         cls, site: SiteLog, timed: TimedMessages[LinkStats], source: str
     ) -> "Table":
-        """Creates the table of a site's statistics about its network links, a row per message.
+        """Creates a table of a site's network link statistics, with one row per message.
 
-        A field that contains a number per peer (other site) becomes a column per peer.
+        A field with one value per peer becomes one column per peer.
 
         Args:
-            site: Records of the site (arm controller).
-            timed: The statistics messages, with their times of arrival and sending.
+            site: Records of the site.
+            timed: The statistics messages, with their arrival and sending times.
             source: Name of the file for error messages.
 
         Returns:
-            The table, in the order of the ticks (control periods).
+            The table, in tick order.
 
         Raises:
             LogError: A number is out of range.
@@ -376,16 +374,15 @@ class Table:
     def of_events(cls, timed: TimedMessages[Event], source: str) -> "Table":
         """Creates a table of the events of a session, with one row per event.
 
-        An event is a message about something that happened once, for example that a site (arm
-        controller) has joined. The rows have the order in which the events arrived at the
-        recorder.
+        An event is a message about something that happened once, for example that a site
+        joined. Rows are in the order in which the events arrived at the recorder.
 
         Args:
-            timed: The events, with their times of sending and of arrival.
+            timed: The events, with their sending and arrival times.
             source: Name of the file for error messages.
 
         Raises:
-            LogError: An integer of an event is too large for 64 bits.
+            LogError: An integer of an event does not fit in 64 bits.
         """
         events = timed.messages
         t_ns = _to_int_array((event.t_ns for event in events), source, "t_ns")
@@ -407,7 +404,7 @@ class Table:
             columns.append(
                 Column(name=field, values=values, unit=unit, meaning=text, source=field)
             )
-        return cls(EVENTS_TABLE, "", "something that happened once", tuple(columns))
+        return cls(EVENTS_TABLE, "", "an event of the session", tuple(columns))
 
 
 # An entry of the section "Attributes:" in a docstring: name of the field and its meaning.
@@ -418,19 +415,19 @@ _UNITS_BY_ENDING = {"ns": "ns", "us": "us", "ppb": "ns/s"}
 _COMPLETE_TEXTS = {
     "qd_des": "derivative of the reference, Eq. (6)",
     "delay_max_us": (
-        "per peer, largest one-way delay since the last statistics; -1 where nothing came"
+        "per peer, largest one-way delay since the last statistics; -1 if none arrived"
     ),
-    "offset_us": "per peer, its clock minus this site's clock, as in force",
-    "late": "per peer, samples that came after they were due",
-    "duplicate": "per peer, samples that came twice",
+    "offset_us": "per peer, its clock minus this site's clock, as currently used",
+    "late": "per peer, samples that arrived after they were due",
+    "duplicate": "per peer, samples that arrived twice",
     "refused": "per peer, samples whose stamp was out of range",
-    "lost": "per peer, samples that the link's model lost",
+    "lost": "per peer, samples lost by the link's model",
 }
-"""Meanings of fields whose text in the docstring cannot be understood alone."""
+"""Meanings of fields whose description in the docstring cannot be understood on its own."""
 
 
 class _FieldDoc(NamedTuple):
-    """Unit, meaning and type of one field of a message, for the head of an exported table.
+    """Unit, meaning and type of one field of a message, for the header of an exported table.
 
     Attributes:
         unit: Unit of the field. Empty if it has no unit.
@@ -447,13 +444,13 @@ class _FieldDoc(NamedTuple):
 def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, _FieldDoc]:
     """Collects the documentation of the fields of a message type.
 
-    The meanings are taken from the docstring of the type, and the units from its JSON Schema.
+    The meanings come from the docstring of the type, and the units from its JSON Schema.
 
     Args:
         kind: Type of the messages, such as `State`.
 
     Returns:
-        The documentation by name of the field, in the order of definition.
+        Maps the name of each field to its documentation, in order of definition.
     """
     docstring = inspect.getdoc(kind) or ""
     texts = dict(_FIELD.findall(docstring))
@@ -477,7 +474,7 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, _FieldDoc]:
 def _to_int_array(
     values: Iterable[int], source: str, field: str, kind: Any = np.int64
 ) -> NDArray[Any]:
-    """Converts integers of a log to an array, and refuses those that are too large for it.
+    """Converts integers of a log to an array, rejecting those that do not fit.
 
     Args:
         values: The integers.
@@ -489,7 +486,7 @@ def _to_int_array(
         The array, shape (K,) for K integers.
 
     Raises:
-        LogError: A number does not fit into the data type.
+        LogError: An integer does not fit into the data type.
     """
     try:
         return np.fromiter(values, kind)
@@ -502,13 +499,11 @@ def _make_time_columns(
 ) -> Iterator[Column]:
     """Yields the first columns of a table: nominal time, tick, arrival and sending times.
 
-    A tick is the number of a period of the control loop.
-
     Args:
-        tick: Ticks, shape (K,). None if the table has no column of ticks.
-        t_s: Nominal times since the session's start, shape (K,), in s. NaN if unknown.
-        log_ns: Times of arrival at the recorder, in Unix time, shape (K,), in ns.
-        publish_ns: Times of sending, in Unix time, shape (K,), in ns.
+        tick: Ticks, shape (K,). None if the table has no tick column.
+        t_s: Nominal times since the start of the session, shape (K,), in s. NaN if unknown.
+        log_ns: Arrival times at the recorder in Unix time, shape (K,), in ns.
+        publish_ns: Sending times in Unix time, shape (K,), in ns.
     """
     known: NDArray[np.bool_] = ~np.isnan(t_s)
     yield Column(
@@ -521,20 +516,20 @@ def _make_time_columns(
     )
     if tick is not None:
         yield Column(
-            name="tick", values=tick, unit="tick", meaning="number of the tick", source="tick"
+            name="tick", values=tick, unit="tick", meaning="tick number", source="tick"
         )
     yield Column(
         name="log_time_ns",
         values=log_ns,
         unit="ns",
-        meaning="when it came to the recorder, Unix time",
+        meaning="time of arrival at the recorder, Unix time",
         source="log_time",
     )
     yield Column(
         name="publish_time_ns",
         values=publish_ns,
         unit="ns",
-        meaning="when it was sent, Unix time",
+        meaning="time of sending, Unix time",
         source="publish_time",
     )
 
@@ -542,12 +537,12 @@ def _make_time_columns(
 def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     """Yields the columns of the vectors in an arm's records, such as joint angles and torques.
 
-    Each vector has a number per joint, per coordinate of the end effector, or per parameter of
+    Each vector has one entry per joint, per coordinate of the end effector, or per parameter of
     the dynamics. If the arms share the pose of the end effector instead of joint angles, the
     reference and its velocity are vectors of the end effector.
 
     Args:
-        site: Records (results of control periods) of the arm.
+        site: Records of the arm.
         arm: Model of the arm.
     """
     end_effector_vectors = _TASK_VECTORS if arm.shares_pose else {}
@@ -560,7 +555,7 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_joint_columns(site: SiteLog, arm: ArmModel, field: str) -> Iterator[Column]:
-    """Yields the columns of a vector that has a number per joint."""
+    """Yields the columns of a vector that has one entry per joint."""
     doc = read_field_docs(State)[field]
     units = arm.joint_units(doc.unit)
     for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
@@ -575,12 +570,12 @@ def _make_joint_columns(site: SiteLog, arm: ArmModel, field: str) -> Iterator[Co
 def _make_task_columns(
     site: SiteLog, arm: ArmModel, field: str, units: tuple[str, str]
 ) -> Iterator[Column]:
-    """Yields the columns of a vector with a number per coordinate of the end effector.
+    """Yields the columns of a vector with one entry per coordinate of the end effector.
 
     An example is the position x, y and z.
 
     Args:
-        site: Records of the site (arm controller).
+        site: Records of the site.
         arm: Model of the site's arm.
         field: Name of the vector.
         units: Units of the position coordinates and of the other coordinates.
@@ -605,7 +600,7 @@ def _make_task_columns(
 def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     """Yields the columns of the estimated parameters of the arm's dynamics.
 
-    The two-link arm of the paper has parameters with numbers, such as theta_hat3. A chain of
+    The parameters of the two-link arm of the paper are numbered, as in theta_hat3. A chain of
     joints has the same parameters for each link, such as theta_hat2_m, the mass of the second
     link.
     """
@@ -626,10 +621,10 @@ def _make_parameter_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
-    """Yields four columns of a table with an orientation, as a unit quaternion.
+    """Yields the four columns of an orientation, given as a unit quaternion.
 
     Args:
-        site: Records of the site (arm controller).
+        site: Records of the site.
         field: Name of the vector that contains the poses.
         text: Meaning of the vector.
     """
@@ -655,15 +650,15 @@ def _make_number_column(
     text: str,
     known: NDArray[np.bool_] | None = None,
 ) -> Column:
-    """Returns a table column with one number of a vector, for example of joint 1 of "q".
+    """Returns a table column with one entry of a vector, for example joint 1 of "q".
 
     Args:
-        site: Records of the site (arm controller).
+        site: Records of the site.
         field: Name of the vector.
-        n: Index of the number in the vector.
+        n: Index of the entry in the vector.
         stem: Name of the column without its unit.
-        unit: Unit of the number.
-        text: Meaning of the number.
+        unit: Unit of the entry.
+        text: Meaning of the entry.
         known: True for the rows that have a value, shape (K,). None if all rows have one.
     """
     suffix = UNIT_SUFFIXES.get(unit, "")
@@ -677,9 +672,9 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
-    """Yields the columns of the numbers that a site's control law sends to other sites.
+    """Yields the columns of the vectors that a site's control law sends to other sites.
 
-    Their names begin with "ch_". For example "ch_force_m1_nm" is a torque that is sent to m1.
+    Their names begin with "ch_". For example, "ch_force_m1_nm" is a torque that is sent to m1.
     """
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
@@ -709,7 +704,7 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
     Args:
         site: Records of the site.
         arm: Model of the site's arm.
-        mode: How the operator moves the arm: to a target of the tip ("tip") or of the joints
+        mode: How the operator moves the arm: to a target for the tip ("tip") or for the joints
             ("joint"), or by a force ("force").
     """
     held: NDArray[np.bool_] = site.hand[:, 2] > 0.0
@@ -757,22 +752,23 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
     """Yields the columns of the poses of the bodies in the site's simulated environment.
 
-    Each record contains a pose of seven numbers for each body: the position (x, y, z) in m, and
-    the orientation as a unit quaternion (w, x, y, z). A quaternion and its negative are the
-    same orientation. The signs are chosen so that the curves of the four numbers do not jump.
+    For each body, a record contains a pose of seven numbers: the position (x, y, z) in m, and
+    the orientation as a unit quaternion (w, x, y, z). A quaternion and its negative represent
+    the same orientation. Signs are chosen such that the curves of the four components do not
+    jump.
 
     Args:
-        site: Records of the site, the process that runs one arm.
-        bodies: Names of the bodies, in the order of the records.
+        site: Records of the site.
+        bodies: Names of the bodies, in record order.
 
     Yields:
-        Seven columns for each body, such as "cup_x_m" and "cup_qw", with a row per record.
+        Seven columns per body, such as "cup_x_m" and "cup_qw", with one row per record.
     """
     pose_length = POSITION + len(QUATERNION_AXES)
     for body_index, body in enumerate(bodies):
         position_start = pose_length * body_index
         for index, axis in enumerate("xyz", position_start):
-            text = f"{axis} of the place of {body}, a body of its plant"
+            text = f"{axis} position of {body}, a body of its plant"
             yield _make_number_column(
                 site=site, field="bodies", n=index, stem=f"{body}_{axis}", unit="m", text=text
             )
@@ -797,10 +793,9 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Column]:
-    """Yields the columns that state which sample of a peer the control law used, and its age.
+    """Yields the columns for the sample of a peer that the control law used, and its age.
 
-    A sample is the state that another site (arm controller), the peer, has sent. Its age is the
-    total delay that the control law sees.
+    The age is the total delay that the control law sees.
 
     Args:
         site: Records of the receiving site.
@@ -816,7 +811,7 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
         name=f"used_{peer}_tick",
         values=used_ticks,
         unit="tick",
-        meaning=f"tick of the sample of {peer} in use",
+        meaning=f"tick of the sample from {peer} in use",
         source=source,
         known=known,
     )
@@ -824,7 +819,7 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
         name=f"age_{peer}_ms",
         values=age_ms,
         unit="ms",
-        meaning=f"now minus the stamp of the sample of {peer} in use",
+        meaning=f"time since the stamp of the sample from {peer} in use",
         source=f"t_ns, {source}",
         known=known,
     )
@@ -833,11 +828,11 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
 def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
     """Returns the reasons why messages were dropped, each of which becomes a column.
 
-    The reasons are in the order in which they first occur. Reasons that give the same column
-    name are listed once.
+    The reasons are in the order in which they first occur. Reasons that result in the same
+    column name are listed once.
 
     Args:
-        dropped: Numbers of dropped messages by reason, for each statistics message.
+        dropped: For each statistics message, maps reasons to the number of dropped messages.
     """
     reason_by_column: dict[str, str] = {}
     for counts in dropped:
@@ -847,16 +842,16 @@ def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
 
 
 def _to_word(text: str) -> str:
-    """Converts a string to a part of a column name: small letters, digits and underscores."""
+    """Converts a string to part of a column name: lowercase letters, digits and underscores."""
     return re.sub(r"[^a-z0-9]+", "_", text.lower())[:31]
 
 
 def _make_entry_column(
     source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
 ) -> Column:
-    """Creates the column of one entry of a statistics field whose values are maps.
+    """Creates the column for one entry of a statistics field whose values are mappings.
 
-    For example, the field `delay_us` maps each peer to a delay. Its entry of the peer m2
+    For example, the field `delay_us` maps each peer to a delay. Its entry for the peer m2
     becomes the column delay_m2_us. A field without a unit is a count: the entry m2 of
     `accepted` becomes accepted_m2_count.
 
@@ -864,11 +859,11 @@ def _make_entry_column(
         source: Name of the file for error messages.
         field: Name of the field of the statistics.
         name: Key of the entry: a peer, or a reason why messages were dropped.
-        values: The maps, one per row.
+        values: The mappings, one per row.
 
     Returns:
-        The column. A value is unknown if the map has no such entry, or if the entry is -1 in a
-        field where -1 means that there is no value.
+        The column. A value is unknown if the mapping has no such entry, or if the entry is -1
+        in a field where -1 represents a missing value.
     """
     unit, meaning_of_field, _ = read_field_docs(LinkStats)[field]
     stem = field
@@ -895,7 +890,7 @@ def _make_entry_column(
 
 
 def _to_text(value: str | Mapping[str, Any]) -> str:
-    """Converts a field of an event (a notable occurrence in a session) to a table cell.
+    """Converts a field of an event to the string in a table cell.
 
     A dictionary becomes JSON, but an empty dictionary becomes the empty string.
     """

@@ -1,13 +1,11 @@
-"""Defines the results of checks: whether each check passed, and the problems that it found.
+"""Defines the results of checks: whether each check passed, and the problems it found.
 
-A check examines one property of a log, the file with the messages of a session, for example
-that no message is missing. Its result is a `Finding`. `trilat log check` prints one line per
-finding.
+A check examines one property of a log, for example that no message is missing. Its result is a
+`Finding`. `trilat log check` prints one line per finding.
 
 Invariant:
-    - A check with a problem has not passed.
-    - At most `_MAX_LISTED_PROBLEMS` problems of a check are stored. Further problems are only
-      counted.
+    - A check that found a problem has not passed.
+    - At most `_MAX_LISTED_PROBLEMS` problems of a check are stored. Any more are only counted.
 """
 
 from dataclasses import dataclass, field
@@ -17,16 +15,16 @@ from ..errors import CodeWithheld
 from ..results import Result
 
 _MAX_LISTED_PROBLEMS = 1000
-"""Largest number of problems that a finding stores. Further problems are only counted."""
+"""Maximum number of problems that a finding stores. Any more are only counted."""
 
 
 class _ProblemPlace(NamedTuple):
-    """A problem that a check has found in a file, with its place in this file.
+    """A problem that a check found in a file, with its position in the file.
 
     Attributes:
         file: Name of the file.
         offset: Offset of the problem in the file, or of the chunk that contains it, in bytes.
-            None if the problem concerns the whole file.
+            None if the problem affects the file as a whole.
         text: Description of the problem.
     """
 
@@ -42,18 +40,17 @@ class _ProblemPlace(NamedTuple):
 class Finding:
     """Result of one check of a log or a run, such as the check for missing records.
 
-    It contains the problems that the check found.
+    Holds the problems that the check found.
 
     Attributes:
         check: Name of the check. Every file is checked for "whole", "checksums", "records" and
             "index", and a log of trilat-net also for "sequence", "accounts", "chain", "schema",
-            "times", "rates" and "scenario". When a run is executed again and compared, the name
-            is the subject of the comparison.
+            "times", "rates" and "scenario". When a run is repeated and compared, the name is
+            the subject of the comparison.
         text: The result in one line.
         passed: True if the check passed.
-        judged: True if the check could be carried out. It is False if the check would run code
-            from outside that the user has not permitted. In this case, the check has not
-            passed.
+        judged: True if the check could be carried out. False if it would have run third-party
+            code that the user has not permitted, in which case the check has not passed.
         places: The problems, at most `_MAX_LISTED_PROBLEMS`.
         wrong: Number of problems, including those that are not stored.
     """
@@ -66,14 +63,14 @@ class Finding:
     wrong: int = 0
 
     def add(self, file: str, offset: int | None, text: str) -> None:
-        """Adds a problem to the check, which has therefore not passed.
+        """Adds a problem, which means that the check has not passed.
 
-        Only the first `_MAX_LISTED_PROBLEMS` problems are stored. All are counted.
+        Only the first `_MAX_LISTED_PROBLEMS` problems are stored, but all are counted.
 
         Args:
             file: Name of the file in which the problem was found.
-            offset: Offset of the problem in the file, in bytes. None if it concerns the whole
-                file.
+            offset: Position of the problem in the file, in bytes. None if the problem affects
+                the file as a whole.
             text: Description of the problem.
         """
         self.passed = False
@@ -82,33 +79,30 @@ class Finding:
             self.places.append(_ProblemPlace(file, offset, text))
 
     def summary(self) -> str:
-        """Summarises the problems that one check of a log has found, in one line.
+        """Summarises the problems found by one check of a log, in one line.
 
-        The line has the first problem and the number of further problems. There must be at
-        least one.
-
-        Returns:
-            The first problem and the number of further problems.
+        The line consists of the first problem and the number of further problems. There must be
+        at least one problem.
         """
         first = str(self.places[0])
         return f"{first}; and {self.wrong - 1} more" if self.wrong > 1 else first
 
     def conclude(self, sound: str) -> "Finding":
-        """Completes the finding with a text, after all problems were added.
+        """Sets the text of the finding once all problems have been added.
 
         If there are problems, the text summarises them.
 
         Args:
-            sound: Text of the finding if there is no problem.
+            sound: Text to use if there is no problem.
 
         Returns:
-            The finding itself, so that the caller can pass it on directly.
+            The finding itself, for chaining.
         """
         self.text = self.summary() if self.wrong else sound
         return self
 
     def to_row(self) -> dict[str, Any]:
-        """Returns the result of one check of a log as plain values: its name, text and outcome.
+        """Returns the name, text and outcome of one check of a log as plain values.
 
         "judged" is False if the check could not be carried out. The individual problems are
         left out, because the text summarises them.
@@ -122,10 +116,10 @@ class Finding:
 
 
 class Findings(dict[str, Finding]):
-    """Results of several checks of a log, by name of the check, in the order of first use.
+    """Mapping from the name of a check of a log to its result, in order of first use.
 
-    If a name that does not exist yet is read, a result without problems is created for it. Thus
-    a check can add a problem by `findings["records"]` at any point.
+    Reading a name that does not exist yet creates a result with no problems, so any code can
+    add a problem with `findings["records"]`.
     """
 
     def __missing__(self, check: str) -> Finding:
@@ -134,10 +128,10 @@ class Findings(dict[str, Finding]):
 
 
 class CheckReport(Result):
-    """Base class of the results of commands that check a log in several respects.
+    """Base class for the results of commands that run several checks on a log.
 
-    From the results of the individual checks, it determines whether the log passed, and the
-    exit code of the command.
+    Derives from the individual findings whether the log passed, and the exit code of the
+    command.
 
     Attributes:
         findings: The result of each check.
@@ -152,11 +146,11 @@ class CheckReport(Result):
 
     @property
     def exit_code(self) -> int:
-        """Exit code with which a command that reports these checks ends.
+        """Exit code of a command that reports these checks.
 
         - 1 if a check failed.
-        - The exit code of `CodeWithheld` if no check failed, but a check could not be carried
-          out. Such a check would run code from outside that the user has not permitted.
+        - The exit code of `CodeWithheld` if no check failed but one could not be carried out,
+          because it would have run third-party code that the user has not permitted.
         - 0 if every check passed.
         """
         if any(finding.judged and not finding.passed for finding in self.findings):
@@ -164,7 +158,7 @@ class CheckReport(Result):
         return 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns one dictionary per check of the log, for a table or for JSON.
+        """Returns one dictionary per check of the log, for output as a table or as JSON.
 
         The keys are "label", "text", "passed" and "judged".
         """

@@ -1,14 +1,14 @@
-"""Writes the file of a log so that it survives crashes, power failures and full disks.
+"""Writes the file of a log in a way that survives crashes, power failures and full disks.
 
-A log contains the messages of a run. While it is recorded, the file is called run.mcap.active,
-and after it is complete, run.mcap. Data are flushed once the operating system has them, and
-synced once they are on the disk.
+While it is being recorded, the file is called run.mcap.active; once complete, it is renamed to
+run.mcap. Data are flushed when the operating system has them, and synced when they are on the
+disk.
 
 Invariant:
-    - Flushed data survive the death of the process. Synced data survive a loss of power.
+    - Flushed data survive the death of the process. Synced data survive a power failure.
     - Only a finished log gets the final name. An existing file is replaced only with `force`.
-    - Disk space for the end of the file is reserved. If the disk becomes full, the file still
-      ends as the format requires, with all data that were written before.
+    - Disk space is reserved for the end of the file. If the disk fills up, the file still ends
+      as the format requires and contains all data written before.
     - Syncing may block for a long time. It runs in a thread unless `durable` is set.
 """
 
@@ -29,16 +29,15 @@ from .log_layout import active_path
 from .mcap_records import MAGIC
 
 _DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Error numbers of a disk that accepts no more data."""
+"""Error numbers that indicate a disk that accepts no more data."""
 RESERVE_STEP_BYTES = 1 << 19
-"""Step by which the reserved space grows, in bytes."""
+"""Increment by which the reserved space grows, in bytes."""
 
 
 class DiskReserve:
-    """Disk space that is reserved by a temporary file without a name.
+    """Disk space reserved by an unnamed temporary file.
 
-    When the space is needed, the temporary file is closed, and another file on the same disk
-    can use the space.
+    Closing the temporary file frees the space for another file on the same disk.
 
     Args:
         folder: Any folder on the disk.
@@ -54,16 +53,16 @@ class DiskReserve:
         self._is_possible = True
 
     def grow(self, size: int) -> None:
-        """Reserves disk space, so that it cannot be used up by other programs.
+        """Reserves disk space so that other programs cannot use it up.
 
-        Nothing happens if the disk does not support reservations, or if the space has been
+        Does nothing if the disk does not support reservations, or if the space has been
         released.
 
         Args:
-            size: Number of bytes that must be reserved in total.
+            size: Total number of bytes that must be reserved.
 
         Raises:
-            OSError: The disk has no room.
+            OSError: The disk is full.
         """
         if not self._is_possible or size <= self.size:
             return
@@ -83,8 +82,7 @@ class DiskReserve:
     def release(self) -> None:
         """Frees the reserved disk space, so that the last part of a log fits on a full disk.
 
-        This happens when the disk refuses data, or when the file is closed. Later calls of
-        `grow` reserve nothing.
+        Called when a write fails or the file is closed. Later calls of `grow` reserve nothing.
         """
         self._is_possible = False
         self.size = 0
@@ -94,12 +92,12 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
-    """Reserves disk space for a file from one offset up to another.
+    """Reserves disk space for a file from one offset to another.
 
     If the file system cannot reserve space, zeros are written.
 
     Raises:
-        OSError: The disk has no room.
+        OSError: The disk is full.
     """
     if hasattr(os, "posix_fallocate"):
         try:
@@ -115,11 +113,11 @@ def _allocate(descriptor: int, begin: int, end: int) -> None:
 
 
 SYNC_PERIOD_NS = 1_000_000_000
-"""Period with which a thread syncs the file, in ns."""
+"""Period at which a thread syncs the file, in ns."""
 
 
 class _FileSync:
-    """Forces the data of one file onto the disk (sync), so that they survive a loss of power.
+    """Syncs the data of one file to the disk, so that they survive a power failure.
 
     Args:
         descriptor: Descriptor of the file in the operating system.
@@ -137,14 +135,14 @@ class _FileSync:
         self._disk_error: OSError | None = None
 
     def sync_new(self) -> None:
-        """Forces the data that were written since the last call onto the disk.
+        """Syncs the data written since the last call to the disk.
 
-        If `durable` is set, the method waits until the data are on the disk. Otherwise a thread
-        forces them onto the disk. The thread is started only if its previous work has ended and
-        began at least a second ago.
+        If `durable` is set, the method blocks until the data are on the disk. Otherwise a
+        thread syncs them, and it is started only if the previous sync has finished and began at
+        least a second ago.
 
         Raises:
-            OSError: The disk refuses the data, or has refused earlier data.
+            OSError: Writing to the disk failed, in this call or an earlier one.
         """
         if self._durable:
             _datasync(self._descriptor)
@@ -159,32 +157,32 @@ class _FileSync:
             self._thread.start()
 
     def _run(self) -> None:
-        """Syncs the file in the thread, and stores an error for the next call of `sync_new`."""
+        """Syncs the file in the thread, and stores any error for the next `sync_new`."""
         try:
             _datasync(self._descriptor)
         except OSError as error:
             self._disk_error = error
 
     def wait(self) -> None:
-        """Waits until a thread has forced the written data of the log onto the disk.
+        """Waits until the thread has finished syncing the log to the disk.
 
-        The file must not be closed before that, because the thread uses its descriptor.
+        The file must not be closed earlier, because the thread uses its descriptor.
         """
         if self._thread is not None:
             self._thread.join()
 
 
 def _datasync(descriptor: int) -> None:
-    """Forces the written data of a file onto the disk, so that a power failure loses nothing.
+    """Syncs the written data of a file to the disk, so that a power failure loses nothing.
 
-    If the system has `fdatasync`, it is used instead of `fsync`, because it leaves out metadata
-    that are not necessary to read the file.
+    Uses `fdatasync` instead of `fsync` where available, because it skips metadata that are not
+    needed to read the file.
     """
     getattr(os, "fdatasync", os.fsync)(descriptor)
 
 
 RESERVE_MARGIN_BYTES = 1 << 16
-"""Space that is reserved for the counts of messages at the end, in bytes."""
+"""Space reserved for the message counts at the end, in bytes."""
 _ELSEWHERE = "choose another disk with -o"
 _ADVICE = {
     errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
@@ -196,14 +194,14 @@ _ADVICE = {
     errno.EIO: ("the disk fails", _ELSEWHERE),
     errno.EROFS: ("the disk has become read-only", _ELSEWHERE),
 }
-"""Problem and advice for the user, by the error number of the disk."""
+"""Maps the error number of the disk to the problem and advice for the user."""
 
 
 def sync_folder(folder: Path) -> None:
-    """Forces the names of new files in a folder onto the disk, so that they survive a crash.
+    """Syncs the names of new files in a folder to the disk, so that they survive a crash.
 
-    Without this, a file may be stored completely, but its name may be lost when the power
-    fails. Nothing happens on platforms that do not support this.
+    Otherwise a power failure may lose the name of a file whose contents were stored completely.
+    Does nothing on platforms without support for syncing folders.
 
     Args:
         folder: The folder.
@@ -217,27 +215,27 @@ def sync_folder(folder: Path) -> None:
 
 
 class LogFile:
-    """Context manager for the file of a log, which is written from its beginning to its end.
+    """Context manager that writes the file of a log from start to finish.
 
-    Written data stay in memory until `flush`, so that the file always ends at the end of a
-    flush, even if the process is killed at any time.
+    Written data stay in memory until `flush`. Even if the process is killed, the file therefore
+    always ends where a flush ended.
 
     Args:
         path: Name of the complete file.
-        force: True if the file may replace an existing one.
+        force: True to allow replacing an existing file.
         durable: True to sync the file at every flush. Otherwise a thread syncs it once a
             second.
         working: Name of the file until it is complete. If None, `active_path(path)` is used.
-        room: Space that is reserved for the end. If None, a `DiskReserve` in the file's folder
-            is created.
-        opened: Function that opens a file without a buffer, by name and mode. For tests.
-        now_ns: Function that returns the time in ns. If None, the clock of the system is used.
+        room: Disk space reserved for the end of the file. If None, a `DiskReserve` in the
+            folder of the file is created.
+        opened: Function that opens an unbuffered file, given its name and mode. For tests.
+        now_ns: Function that returns the time in ns. If None, the system clock is used.
 
     Attributes:
         path: Name of the complete file.
         working: Name of the file until it is complete.
         size: Number of flushed bytes.
-        disk_error: The first error of the disk. None if there was no error.
+        disk_error: The first disk error, or None if there was none.
 
     Raises:
         UsageError: The file exists, or cannot be created.
@@ -254,7 +252,7 @@ class LogFile:
         opened: Callable[[Path, str], Any] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
-        """Creates the log under a working name, which shows that it is not complete yet."""
+        """Creates the log under a working name, which shows that it is not yet complete."""
         self.path = path
         self.working = working or active_path(path)
         self.size = 0
@@ -289,15 +287,12 @@ class LogFile:
         self._published = False
 
     def write(self, data: bytes, /) -> int:
-        """Stores bytes in memory. The next `flush` writes them to the file.
+        """Buffers bytes in memory until the next `flush`, and returns their number.
 
-        A slow disk therefore cannot stop the caller while messages arrive.
+        A slow disk therefore cannot block the caller while messages arrive.
 
         Args:
-            data: The bytes.
-
-        Returns:
-            Their number.
+            data: The bytes to write.
         """
         self._pending += data
         return len(data)
@@ -305,8 +300,8 @@ class LogFile:
     def reserve(self, size: int) -> None:
         """Sets the number of bytes that the end of the file will need.
 
-        The next `flush` reserves disk space for them, so that the file can end properly even
-        if the disk becomes full.
+        The next `flush` reserves disk space for them, so that the file can be finished properly
+        even if the disk fills up.
 
         Args:
             size: The number of bytes.
@@ -314,21 +309,21 @@ class LogFile:
         self._end_bytes = size
 
     def flush(self) -> None:
-        """Writes all stored data to the file.
+        """Writes all buffered data to the file.
 
         There are three cases:
 
-        1. There was no error so far. Before the data are written, disk space is reserved for
-           them and for the end of the file.
-        2. The disk refuses the data for the first time. The reserved space is released, and the
-           data are written again. If this succeeds, they are in the file, but the error is
-           still raised, so that the caller stops and writes only the end of the file.
-        3. The disk refuses the data even then. The file is cut off at the end of the previous
-           flush. Every later call raises the first error.
+        1. No write has failed so far. Disk space is reserved for the data and for the end of
+           the file, then the data are written.
+        2. A write fails for the first time. The reserved space is released, and the data are
+           written again. Even if this succeeds, the error is raised, so that the caller stops
+           and writes only the end of the file.
+        3. The second write fails too. The file is truncated to where the previous flush ended,
+           and every later call raises the first error.
 
         Raises:
-            OSError: The disk refuses the data, now or in an earlier call. Only the end of the
-                file may be written afterwards.
+            OSError: Writing to the disk failed, in this call or an earlier one. Only the end of
+                the file may be written afterwards.
         """
         if self._broken and self.disk_error:
             raise self.disk_error
@@ -349,12 +344,12 @@ class LogFile:
             raise
 
     def _write_pending(self) -> None:
-        """Passes the bytes in memory to the operating system, and notes where the file ends.
+        """Passes the buffered bytes to the operating system, and records where the file ends.
 
         After an error, the next call continues after the bytes that were accepted.
 
         Raises:
-            OSError: The disk refuses the data.
+            OSError: Writing to the disk failed.
         """
         while self._written < len(self._pending):
             accepted = self._raw.write(memoryview(self._pending)[self._written :])
@@ -370,7 +365,7 @@ class LogFile:
         self._written = 0
 
     def _cut_off(self) -> None:
-        """Removes partly written data, so that the file ends where a complete flush ended.
+        """Truncates the file to where a complete flush ended, removing partly written data.
 
         A log that ends with half a chunk could only be read after a recovery.
         """
@@ -382,21 +377,21 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True if the log is complete: it ends with the end mark of the MCAP format.
+        """True if the log is complete, that is, ends with the end mark of the MCAP format.
 
-        Only a complete file gets its final name. Any other file keeps the suffix ".active", and
+        Only a complete file gets its final name. Any other file keeps the suffix ".active" and
         can be recovered.
         """
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
     def close(self) -> None:
-        """Closes the file. A complete file gets its final name, and an empty file is removed.
+        """Closes the file, renaming it to its final name if complete or deleting it if empty.
 
         An incomplete file keeps its working name. Further calls have no effect.
 
         Raises:
-            UsageError: A file with the final name has appeared since the start.
-            OSError: The disk refuses the data.
+            UsageError: A file with the final name has been created in the meantime.
+            OSError: Writing to the disk failed.
         """
         if self._closed:
             return
@@ -420,9 +415,9 @@ class LogFile:
         sync_folder(self.path.parent)
 
     def discard(self) -> None:
-        """Closes and removes the file of a log that is not wanted.
+        """Closes and deletes the file of a log that is not wanted.
 
-        An error while closing is ignored, since no data need to be saved.
+        Errors while closing are ignored, since there are no data to save.
         """
         with suppress(OSError):
             self.close()
@@ -430,14 +425,14 @@ class LogFile:
         self.size = 0
 
     def end(self, error: BaseException | None = None) -> None:
-        """Closes the log's file, and explains an error of the disk to the user.
+        """Closes the file of the log, and explains any disk error to the user.
 
         Args:
-            error: Exception that interrupted the writing. None if nothing interrupted it.
+            error: Exception that interrupted the writing, or None.
 
         Raises:
-            LogRefused: The disk refuses the last data, or `error` states that it has refused
-                earlier data. The text states which data are saved, and where.
+            LogRefused: The last data could not be written, or `error` reports an earlier failed
+                write. The message states which data were saved, and where.
         """
         try:
             self.close()
@@ -455,24 +450,23 @@ class LogFile:
         self.end(error)
 
     def refused(self, error: OSError) -> LogRefused:
-        """Composes the error for the user after the disk refused data.
+        """Builds the error shown to the user after a write to the disk failed.
 
-        The file must be closed before this call, because the text depends on the final state of
-        the file:
+        The file must be closed first, because the message depends on its final state:
 
-        - The reserved space was sufficient for the end: the log is finished, under its final
-          name (`path`), with the data up to the error.
+        - The reserved space was sufficient for the end: the log is finished under its final
+          name (`path`) and contains the data up to the error.
         - Nothing was written: there is no file.
-        - The log is finished, and no write failed, but the file could not be renamed: it keeps
+        - The log is finished and no write failed, but the file could not be renamed: it keeps
           its working name.
-        - Otherwise the file has no proper end, and keeps its working name. The user can recover
+        - Otherwise the file has no proper end and keeps its working name. The user can recover
           it.
 
         Args:
-            error: The error of the operating system.
+            error: The error reported by the operating system.
 
         Returns:
-            The error, whose text states the problem, which data are saved, and what the user
+            An error whose message states the problem, which data were saved, and what the user
             can do.
         """
         problem, advice = _ADVICE.get(
@@ -500,9 +494,9 @@ class LogFile:
 
 
 def _describe_content(path: Path) -> str:
-    """Returns the numbers of records and other messages in a finished log, as a string.
+    """Returns a description of how many records and other messages a finished log contains.
 
-    The numbers are read from the statistics at the end of the file.
+    The counts are read from the statistics at the end of the file.
     """
     from mcap.reader import make_reader
 

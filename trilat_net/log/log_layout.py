@@ -1,12 +1,13 @@
 """Defines how a log is stored: the names of its files, its metadata and its channels.
 
-A log contains the messages of a run in the file format MCAP. While it is recorded, the file is
-called run.mcap.active. A recording that is split has the files run-001.mcap, run-002.mcap and
-so on. A channel contains the messages of one kind and sender. The metadata state the session,
-the filter (which channels are recorded), and the versions of the program (`log.provenance`).
+A log holds the messages of a run in the MCAP file format. While it is being recorded, the file
+is called run.mcap.active. A recording that is split consists of the files run-001.mcap,
+run-002.mcap and so on. A channel contains the messages of one kind from one sender. The
+metadata describe the session, the filter (which channels are recorded), and the versions of the
+program (`log.provenance`).
 
 Invariant:
-    - A channel that the filter excludes is neither in the file nor in the counts of messages.
+    - A channel excluded by the filter appears neither in the file nor in the message counts.
       The file states the filter.
 """
 
@@ -21,17 +22,17 @@ from ..errors import UsageError
 from ..net import Event, LinkStats, RecorderStats, State, matches_key, topics
 
 ACTIVE_SUFFIX = ".active"
-"""Suffix of a log's file name while the log is being recorded."""
+"""Suffix of the name of a log file while it is being recorded."""
 PART_STEM = re.compile(r"(.+)-(\d{3,})")
-"""Stem of a part's file name: stem of the log's name, and number of the part."""
+"""Stem of a part's file name: the stem of the log's name and the number of the part."""
 _CHUNK = re.compile(r"\*\*?|(?:\$\*|[^*$#?])+", re.DOTALL)
-"""Valid part of a Zenoh key expression, between slashes."""
+"""Pattern for a valid part of a Zenoh key expression, between slashes."""
 
 
 def active_path(path: Path) -> Path:
-    """Returns the name that the file of a log has while it is being recorded.
+    """Returns the name of a log file while it is being recorded.
 
-    It is the final name with the suffix `ACTIVE_SUFFIX`. A path without a file name, such as
+    This is the final name with the suffix `ACTIVE_SUFFIX`. A path without a file name, such as
     ".", is returned unchanged.
 
     Args:
@@ -44,14 +45,14 @@ def describe_unfinished(path: Path) -> str:
     """Suggests how to recover a log that was never finished.
 
     A log has the suffix `.active` while it is being recorded. If a user asks for a log that
-    does not exist, but the `.active` file does, the recording was probably interrupted.
+    does not exist but whose `.active` file does, the recording was probably interrupted.
 
     Args:
         path: The log that the user asked for.
 
     Returns:
-        A continuation of an error message that names the unfinished file and the command to
-        recover it. Empty if there is no such file, or if the log exists.
+        Text to append to an error message, with the name of the unfinished file and the command
+        that recovers it. Empty if there is no such file, or if the log exists.
     """
     unfinished = active_path(path)
     if path.exists() or not unfinished.exists():
@@ -67,31 +68,30 @@ def part_path(path: Path, number: int) -> Path:
 
     Args:
         path: Name of the log.
-        number: Number of the part, from 1 on. If it is 0, the name of the log is returned.
+        number: Number of the part, counted from 1. If 0, the name of the log is returned.
     """
     return path.with_name(f"{path.stem}-{number:03}{path.suffix}") if number else path
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
-    """Selects the channels of a session that are recorded, by key expressions of Zenoh.
+    """Selects which channels of a session are recorded, using Zenoh key expressions.
 
-    A key expression is the key of a channel, in which wildcards may stand for names.
+    A key expression is the key of a channel, optionally with wildcards.
 
     Attributes:
-        include: Expressions of channels to record. If there are no expressions, all channels
-            are recorded.
-        exclude: Expressions of channels that are not recorded, even if they are included.
+        include: Key expressions of channels to record. If empty, all channels are recorded.
+        exclude: Key expressions of channels not to record, even if they are included.
     """
 
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
 
     def accepts(self, key: str) -> bool:
-        """Returns True if the messages of a channel are recorded, by the user's patterns.
+        """Returns True if the user's filter selects a channel for recording.
 
         Args:
-            key: Key of the channel in the network, such as "trilat/paper/m1/state".
+            key: Network key of the channel, such as "trilat/paper/m1/state".
         """
         if any(matches_key(expression, key) for expression in self.exclude):
             return False
@@ -100,29 +100,29 @@ class ChannelFilter:
         return any(matches_key(expression, key) for expression in self.include)
 
     def facts(self) -> Mapping[str, str]:
-        """Converts the filter to texts, which the metadata of a log contain.
+        """Converts the filter to strings for the metadata of a log.
 
-        `ChannelFilter.parse_facts` converts the texts to a filter again.
+        `ChannelFilter.parse_facts` converts them back to a filter.
 
         Returns:
-            The key expressions under "include" and "exclude", separated by spaces. Each entry
-            is left out if it has no expressions.
+            The key expressions, separated by spaces, under "include" and "exclude". A key
+            without expressions is omitted.
         """
         texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
         return {name: text for name, text in texts.items() if text}
 
     @classmethod
     def parse(cls, include: Collection[str], exclude: Collection[str]) -> "ChannelFilter":
-        """Parses the options `--include` and `--exclude` of a command.
+        """Creates a filter from the command-line options `--include` and `--exclude`.
 
         A leading slash, as in topics, is ignored.
 
         Args:
-            include: Key expressions of `--include`.
-            exclude: Key expressions of `--exclude`.
+            include: Key expressions given with `--include`.
+            exclude: Key expressions given with `--exclude`.
 
         Raises:
-            UsageError: A string is not a key expression and would match no channel.
+            UsageError: A string is not a valid key expression and would match no channel.
         """
         for option, expressions in (("--include", include), ("--exclude", exclude)):
             for expression in expressions:
@@ -142,14 +142,13 @@ class ChannelFilter:
     def parse_facts(cls, about: Mapping[str, str]) -> "ChannelFilter":
         """Reads from the metadata of a log which channels were recorded.
 
-        The metadata contain the texts that `ChannelFilter.facts` returns.
+        The metadata contain the strings that `ChannelFilter.facts` returns.
 
         Args:
             about: Metadata of the session.
 
         Returns:
-            The filter of the channels. It accepts all channels if the metadata contain no
-            filter.
+            The channel filter. It accepts all channels if the metadata contain no filter.
         """
         return cls(
             include=tuple(about.get("include", "").split()),
@@ -158,30 +157,32 @@ class ChannelFilter:
 
 
 ALL_CHANNELS = ChannelFilter()
-"""The filter that records all channels."""
+"""Filter that records all channels."""
 
 
 VIZ_ROOT = "/viz/"
-"""Prefix of the topics that are written for viewers such as Foxglove."""
+"""Prefix of the topics for viewers such as Foxglove."""
 MAX_TIME_NS = (1 << 64) - 1
-"""Largest time stamp of a message in a file. Later times are stored as this time."""
+"""Largest time stamp of a message in a file, in ns. Later times are stored as this time."""
 SESSION = "trilat.session"
-"""Name of the metadata that describe the session."""
+"""Name of the metadata record that describes the session."""
 PART = "trilat.part"
-"""Name of the metadata that state which part of a log the file is."""
+"""Name of the metadata record that states which part of a log the file is."""
 ACCOUNTS = "trilat.accounts"
-"""Name of the metadata with the numbers of received and missing messages of each channel."""
+"""Name of the metadata record with the numbers of received and missing messages of each
+channel.
+"""
 SCENARIO = "scenario.toml"
-"""Name of the attachment with the text of the scenario."""
+"""Name of the attachment that contains the text of the scenario."""
 CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
     topics.STATE: State,
     topics.LINK: LinkStats,
     topics.EVENT: Event,
     topics.STATS: RecorderStats,
 }
-"""Type of the messages of each channel."""
+"""Maps each channel to the type of its messages."""
 EXECUTED_SITES_KEY = "rerun_executed"
-"""Key of the session's metadata that lists the sites that a rerun executed. The records of the
+"""Key of the session metadata that lists the sites executed in a rerun. The records of the
 other sites are copied from the original log.
 """
 RERUN_DRIVER = "rerun"

@@ -1,25 +1,26 @@
-"""Opens the log of a run, and gives access to the states of each arm as arrays.
+"""Opens the log of a run, and provides the states of each arm as arrays.
 
     log = open_log("run.mcap")
     log["m1"].t_s, log["m1"].q
 
-Here "m1" is the name of an arm, t_s is the time of each period of its control loop, and q has
-its joint angles, a row per period. A run may have several files, because a recorder can split
-its log, and because several recorders can record parts of one session. These files are read as
+Here "m1" is the name of an arm, t_s contains the time of each tick, and q the joint angles of
+the arm, with one row per tick. A run may have several files, because a recorder can split its
+log, and because several recorders can each record part of one session. Such files are read as
 one log.
 
-`Log.link_delays` has the measured network delays between two arms, so that a scenario with
-`model = "trace"` can reproduce them.
+`Log.link_delays` contains the measured network delays between two arms, which a scenario with
+`model = "trace"` can reproduce.
 
 Invariant:
-    - Files of every released schema version can be opened. A file that is cut off is read up to
-      its end, and `Log.complete` is False for it.
+    - Files of every released schema version can be opened. A truncated file is read up to its
+      end, and `Log.complete` is False.
     - Messages are decoded when they are accessed. An invalid record raises an error that names
-      the file. An invalid event or statistics message is skipped, and `Log.unreadable` reports
-      it.
+      the file. An invalid event or statistics message is skipped and reported in
+      `Log.unreadable`.
     - Channels of other sessions and members are ignored.
-    - A sample counts as lost only if every tick in which it could have arrived, up to the
-      longest delay of the link, has a record. Samples whose arrival is unknown are left out.
+    - A sample counts as lost only if there is a record of every tick in which it could have
+      arrived, up to the longest delay of the link. Samples whose arrival is unknown are left
+      out.
 """
 
 import hashlib
@@ -88,30 +89,29 @@ M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
 class Log(Result, Mapping[str, SiteLog]):
-    """A recorded session: the records of each arm controller (site), by the site's name.
+    """A recorded session: a mapping from the name of each site to its records.
 
-    For example, `log["m1"].q` are the joint angles of the arm m1. `open_log` creates this
-    object from one file, or from several files of one session.
+    For example, `log["m1"].q` contains the joint angles of the arm m1. Logs are created by
+    `open_log`, from one file or from several files of one session.
 
     Args:
         contents: Contents of the file, or of all files together.
 
     Attributes:
-        source: Name of the file. For several files, the name of the first one and their number.
-        sources: Names of the files, in the order of their messages.
+        source: Name of the file. For several files, the name of the first and their number.
+        sources: Names of the files, in message order.
         session: Metadata of the session: driver, seed, start time, versions, commit,
             fingerprint.
         driver: How the session ran: "live", "virtual" (simulated time) or "rerun".
-        scenario: The scenario that ran.
+        scenario: The scenario that was run.
         scenario_text: Text of the scenario, as stored in the file.
-        scenario_sha256: SHA-256 of that text.
-        sites: Names of the sites (arm controllers), in the order of the scenario.
-        events: Events of all members (processes of a session), grouped by member, in the order
-            of their numbers.
-        damaged: A sentence for each part of the file that cannot be read.
-        chain: Result of the comparison with the digests that the file contains. For several
+        scenario_sha256: SHA-256 hash of that text.
+        sites: Names of the sites, in scenario order.
+        events: Events of all members, grouped by member, in numerical order.
+        damaged: One sentence for each part of the file that cannot be read.
+        chain: Result of comparing the contents with the digests stored in the file. For several
             files, the worst result.
-        unreadable: A sentence for each channel with messages that cannot be decoded.
+        unreadable: One sentence for each channel with messages that cannot be decoded.
 
     Raises:
         LogError: The scenario cannot be read.
@@ -153,11 +153,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
         Args:
             sources: Paths of logs, or of folders that contain logs.
-            progress: Function that is called repeatedly with the number of bytes read and their
+            progress: Function that is called repeatedly with the number of bytes read and the
                 total over all files.
 
         Returns:
-            A log per session. Files of the same session are read as one log.
+            One log per session. Files of the same session are read as one log.
 
         Raises:
             LogError: A folder contains no log, or a file cannot be read.
@@ -176,9 +176,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def headline(self) -> str:
         """Summarises the session in one line for the user.
 
-        The line says how the session ran, its sites (arm controllers), its length and its
-        number of records (results of control periods). It ends with "not finished" if the end
-        of the log is missing.
+        The line states how the session ran, its sites, its duration and its number of records.
+        It ends with "not finished" if the end of the log is missing.
         """
         try:
             summary = self._describe_records()
@@ -190,7 +189,7 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def why_empty(self) -> str:
-        """Clause of an error text that says that no site has a record in this log.
+        """Clause for an error message, saying that no site has a record in this log.
 
         Empty if at least one site has a record.
         """
@@ -198,7 +197,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return "" if has_records else "no site has a record in this log"
 
     def require_records(self) -> None:
-        """Raises an error if the log has no record, because there is nothing to judge.
+        """Raises LogError if the log contains no records, as there is then nothing to judge.
 
         Raises:
             LogError: No site has a record.
@@ -207,7 +206,7 @@ class Log(Result, Mapping[str, SiteLog]):
             raise LogError(f"{self.source}: {self.why_empty}, so there is nothing to judge")
 
     def _describe_records(self) -> str:
-        """Returns the length of the session and the numbers of its records, as a string."""
+        """Returns a description of the session's duration and numbers of records."""
         last_times_s = [float(self[name].t_s[-1]) for name in self.sites if len(self[name])]
         length_s = max(last_times_s, default=0.0)
         records = sum(len(self[name]) for name in self.sites)
@@ -224,8 +223,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def to_dict(self) -> dict[str, Any]:
         """Returns a summary of the session, with the keys of `trilat sim --json`.
 
-        The entry "sites" maps the name of each site (arm controller) to its summary figures.
-        The records (results of control periods) themselves are not included.
+        The entry "sites" maps the name of each site to its summary figures. The records
+        themselves are not included.
         """
         return {
             "files": list(self.sources),
@@ -241,10 +240,10 @@ class Log(Result, Mapping[str, SiteLog]):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the sites as plain values, with one row per site (arm controller).
+        """Returns a table of the sites as plain values, with one row per site.
 
         A row contains the tick rate of the site, the numbers of its recorded and missing
-        records (results of control periods), and the time of its last record in s.
+        records, and the time of its last record in s.
         """
         rows = []
         for name, site_log in self.items():
@@ -262,7 +261,7 @@ class Log(Result, Mapping[str, SiteLog]):
         """Returns a table of the log as a pandas data frame, for example the records of a site.
 
         Args:
-            name: Name of the table, see `table`. If it is empty, the frame has a row per site.
+            name: Name of the table, see `table`. If empty, the frame has one row per site.
             kind: Kind of the table, see `table`.
         """
         return self.table(name, kind).to_pandas() if name else super().to_frame()
@@ -275,7 +274,7 @@ class Log(Result, Mapping[str, SiteLog]):
         from_s: float | None = None,
         until_s: float | None = None,
     ) -> Any:
-        """Draws the run, or columns of the records over time, with a line per site.
+        """Plots the run, or selected columns of the records over time, with one line per site.
 
         Without arguments, the figure is the overview of the run: errors, speeds, torques and
         ages. Each column has its own panel.
@@ -287,21 +286,21 @@ class Log(Result, Mapping[str, SiteLog]):
 
         Args:
             columns: Quantities such as "q", "tau", "theta_hat", "age" and "mode", the error
-                "e", or single columns of `table`, such as "q1_rad" or "q1". By default "q", "e"
-                and "tau" if another argument is given.
-            sites: The sites to draw. None for all sites.
-            joints: The joints to draw, by number from 1 or by name. None for all joints.
-                Columns that belong to no joint are not affected.
-            from_s: First time to draw, in s. If None, the start of the run.
-            until_s: Last time to draw, in s. If None, the end of the run.
+                "e", or single columns of `table`, such as "q1_rad" or "q1". If another argument
+                is given, the default is "q", "e" and "tau".
+            sites: The sites to plot. If None, all sites.
+            joints: The joints to plot, by name or by number counted from 1. If None, all
+                joints. Columns that do not belong to a joint are not affected.
+            from_s: Start of the plotted interval, in s. If None, the start of the run.
+            until_s: End of the plotted interval, in s. If None, the end of the run.
 
         Returns:
-            A Matplotlib figure, which a notebook displays. Its method `savefig` writes it to a
+            A Matplotlib figure. A notebook displays it, and its method `savefig` writes it to a
             file.
 
         Raises:
             UnknownName: There is no such column, site or joint.
-            UsageError: There are no records in this time, or Matplotlib is not installed.
+            UsageError: There are no records in the interval, or Matplotlib is not installed.
             LogError: The records cannot be read.
         """
         try:
@@ -329,20 +328,20 @@ class Log(Result, Mapping[str, SiteLog]):
         return "/" + topics.key(self.session["session"], member, channel)
 
     def _event_topics(self) -> list[str]:
-        """Returns the topics of the members' events that the log contains, sorted."""
+        """Returns the event topics of the members that occur in the log, sorted."""
         members = (*self.sites, topics.RECORDER)
         event_topics = {self._topic(member, topics.EVENT) for member in members}
         return sorted(event_topics & self._contents.channels.keys())
 
     def _channel(self, topic: str) -> ChannelMessages:
-        """Returns all messages of one topic of the log, for example of one site's records.
+        """Returns all messages of one topic of the log, for example the records of one site.
 
-        The result is empty if the log does not contain the topic.
+        Empty if the log does not contain the topic.
         """
         return self._contents.channels.get(topic) or ChannelMessages()
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
-        """Decodes the messages of a channel, and skips those that are damaged.
+        """Decodes the messages of a channel, skipping those that are damaged.
 
         Messages that cannot be decoded are removed from the channel, so that `unreadable`
         reports them only once even if the channel is decoded again. The log then counts as
@@ -353,7 +352,7 @@ class Log(Result, Mapping[str, SiteLog]):
             kind: Class of the messages.
 
         Returns:
-            The messages that can be decoded, in the order of the file.
+            The messages that can be decoded, in file order.
         """
         channel = self._channel(topic)
         readable = ChannelMessages()
@@ -375,10 +374,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
-        """Returns the events of one process of the session, such as "lost", in their order.
+        """Returns the events of one process of the session, such as "lost".
 
-        A process that is started again numbers its events from 0 again. The starts are in the
-        order in which they first appear in the file, and the events of a start by number.
+        A process that is restarted numbers its events from 0 again. The starts are in the order
+        in which they first appear in the file, and the events of each start in numerical order.
         """
         events = self._decode(topic, Event)
         boots = list(dict.fromkeys(event.boot for event in events))
@@ -389,7 +388,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def diverged_s(self) -> float | None:
         """Time at which the first arm exceeded a safety limit, which ended the run, in s.
 
-        The value is None if all arms stayed within their limits.
+        None if all arms stayed within their limits.
         """
         times_s = [part.diverged_s for part in self.values()]
         known_times_s = [time_s for time_s in times_s if time_s is not None]
@@ -398,12 +397,11 @@ class Log(Result, Mapping[str, SiteLog]):
     def describe_divergence(self, site: str = "") -> str:
         """Describes for the user which joint exceeded its speed limit, by how much, and when.
 
-        If several joints of the arm exceeded their limits, the text names the joint with the
-        largest ratio of speed to limit.
+        If several joints of the arm exceeded their limits, the joint with the largest ratio of
+        speed to limit is described.
 
         Args:
-            site: Name of the site (arm controller) whose arm diverged. Empty for the arm that
-                diverged first.
+            site: Name of the site whose arm diverged. If empty, the arm that diverged first.
 
         Returns:
             A clause such as "m1 joint 2 reached 21.3 rad/s (limit 20 rad/s) at 3.344 s". Empty
@@ -424,16 +422,16 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def may_run_user_laws(self) -> bool:
-        """True if every control law of the run that is a user's class may run.
+        """True if all user-defined control laws of the run have permission to run.
 
-        Whoever permitted the laws of a log also permitted what computes its run again, for
-        example copies of the run that start slightly displaced (twins).
+        This permission also covers analyses that repeat the run, such as twins (copies of the
+        run started with a small displacement).
         """
         return all(law.allowed for law in self.scenario.inspect_user_laws())
 
     @property
     def failed_hands(self) -> list[str]:
-        """Sentences about programs that failed while they moved an arm, for reports on the log.
+        """Sentences for reports, one for each program that failed while it moved an arm.
 
         Each sentence states which program failed, when, and why. Empty if no program failed.
         """
@@ -444,10 +442,10 @@ class Log(Result, Mapping[str, SiteLog]):
         ]
 
     def warn_of_failures(self) -> None:
-        """Issues a Python warning if an arm left its limits, or if a user's program failed.
+        """Issues a Python warning if an arm exceeded its limits or a user's program failed.
 
-        Such a program moves an arm. The warning names the line of code that called the caller
-        of this method.
+        The program is one that moves an arm. The warning points to the line that called the
+        caller of this method.
         """
         for failure in self.failed_hands:
             warnings.warn(failure, RuntimeWarning, stacklevel=3)
@@ -465,8 +463,8 @@ class Log(Result, Mapping[str, SiteLog]):
 
         A recorder that crashes leaves an unfinished file. A log of several files is complete if
         all of them were finished. It is also complete if the last file was finished and no
-        record is missing, because another recorder may have recorded the messages that an
-        unfinished file lacks.
+        record is missing, since another recorder may have recorded what an unfinished file
+        lacks.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
@@ -476,12 +474,11 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._contents.ended and has_all_records
 
     def judge_integrity(self) -> Integrity:
-        """Determines whether the log was changed after it was recorded.
+        """Determines whether the log was modified after it was recorded.
 
-        The contents are compared with the digests, the checksums that the log contains. In
-        addition, the records (results of control periods) are compared with the message counts
-        and the statistics of the recorder. This also reveals changes to a log that was
-        rewritten with new digests.
+        The contents are compared with the digests stored in the log, and the records with the
+        recorder's message counts and statistics. The second comparison also reveals
+        modifications to a log that was rewritten with new digests.
 
         Returns:
             The result, with an explanation.
@@ -499,23 +496,23 @@ class Log(Result, Mapping[str, SiteLog]):
     def _describe_unexplained_gap(self, site: str) -> str:
         """Describes missing or additional records of a site that the log does not explain.
 
-        The recorder states how many records it received and missed, in the account of the site
-        at the end of the file and in its statistics during the recording. Other gaps show that
-        records were removed, or that two logs were joined. There are two tests:
+        The recorder states how many records it received and missed, both in the account of the
+        site at the end of the file and in its statistics during the recording. Any other gap
+        shows that records were removed, or that two logs were joined. There are two tests:
 
-        1. The account must agree with the records. This is not tested if there is no account
-           (the file was not finished), if the file is only a part of a log (the account
-           includes other parts), or if the log consists of several files (see below).
+        1. The account must match the records. Not tested if there is no account (the file was
+           not finished), if the file is only a part of a log (the account includes other
+           parts), or if the log consists of several files (see below).
         2. The ticks must be consecutive, except for ticks that the site did not execute, and
-           for the number of records that the recorder states as missing. This is not tested if
-           the digests, checksums of all messages, show that nothing was changed.
+           for the number of records that the recorder states as missing. Not tested if the
+           digests, checksums of all messages, show that nothing was changed.
 
         Args:
             site: Name of the site.
 
         Returns:
-            The description. Empty if the records agree with the statements of the recorder, or
-            if a part of the file cannot be read, because records may be missing then.
+            The description. Empty if the records match the statements of the recorder, or if a
+            part of the file cannot be read, because records may then be missing.
         """
         if self.damaged:
             return ""
@@ -552,10 +549,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def executed_sites(self) -> tuple[str, ...]:
-        """Names of the sites whose records can be computed again from this file.
+        """Names of the sites whose records can be recomputed from this file.
 
-        These are all sites, except in an open-loop rerun. In an open-loop rerun, some sites are
-        not executed. Their records are copied from the original log and depend on samples that
+        These are all sites, except in an open-loop rerun, where some sites are not executed.
+        The records of those sites are copied from the original log and depend on samples that
         this file does not contain.
         """
         executed = self.session.get(EXECUTED_SITES_KEY)
@@ -565,10 +562,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @property
     def part(self) -> int:
-        """Number of this file, from 1 on, if a long log was split into several files.
+        """Number of this file, counted from 1, if a long log was split into several files.
 
-        It is 0 for a log in a single file, for several files that were opened together, and for
-        a file without a valid number.
+        0 for a log in a single file, for several files that were opened together, and for a
+        file without a valid number.
         """
         if len(self.sources) > 1:
             return 0
@@ -578,14 +575,13 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def accounts(self) -> dict[str, str]:
-        """Numbers of received and missing messages of each topic, as a line of text per topic.
+        """Maps each topic to a line of text with its numbers of received and missing messages.
 
-        The recorder writes them at the end of a file. The dictionary is empty for a file that
-        was not finished. If the log consists of several files, no file states the counts of all
-        messages. Therefore the records (results of control periods), statistics and events of
-        all files are counted again. Counts without a topic, such as those of dropped messages,
-        cannot be determined again. They are the sums over the files, which `merge` has
-        computed.
+        The recorder writes these lines when it finishes a file, so the mapping is empty for an
+        unfinished file. If the log consists of several files, no single file states the totals,
+        so the records, statistics and events of all files are counted again. Counts without a
+        topic, such as that of dropped messages, cannot be recomputed. For these, `merge` has
+        added up the counts of the files.
         """
         written_counts = self._contents.metadata.get(ACCOUNTS, {})
         has_one_file = len(self.sources) == 1
@@ -617,12 +613,12 @@ class Log(Result, Mapping[str, SiteLog]):
         return {**accounts.format_accounts(), **written_counts}
 
     def account(self, site: str) -> str:
-        """Returns the numbers of received and missing records of a site.
+        """Returns the recorder's counts of received and missing records for a site.
 
-        The recorder counted them. They need not agree with the file if the file is damaged.
+        They may disagree with the contents of a damaged file.
 
         Args:
-            site: Name of the site (arm controller).
+            site: Name of the site.
 
         Returns:
             The counts as a line of text, see `accounts`. Empty if the file was not finished.
@@ -630,17 +626,17 @@ class Log(Result, Mapping[str, SiteLog]):
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
     def count_messages(self, topic: str, sequence: Sequence[int]) -> Account | None:
-        """Counts the received and the missing messages of a channel.
+        """Counts the received and missing messages of a channel.
 
-        Ticks (control periods) that the site did not execute are not missing.
+        Ticks that the site did not execute do not count as missing.
 
         Args:
             topic: Topic of the channel.
-            sequence: Tick of every message, in the order of the file.
+            sequence: Tick of each message, in file order.
 
         Returns:
-            The account of the channel. None for a channel without consecutive numbers: only the
-            records and the link statistics of a site have them.
+            The account of the channel. None if the channel is not numbered consecutively: only
+                the records and the link statistics of a site are.
         """
         key = topics.parse_key(topic.removeprefix("/"))
         if (
@@ -657,11 +653,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
-        """Names of the sites (processes that run one arm) whose end is not recorded.
+        """Names of the sites whose end was not recorded.
 
         A site publishes the event "end" when it ends. Without this event, the site may have
-        executed more ticks (control periods) than the log shows. The tuple is empty if the
-        recorder was told not to record events.
+        executed more ticks than the log shows. Empty if the recorder was configured not to
+        record events.
         """
         is_one_of_several_parts = bool(self.part) and len(self.sources) == 1
         if is_one_of_several_parts:
@@ -678,11 +674,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        """Number of control periods (ticks) that each site states when it ends, by site.
+        """Maps each site to the number of ticks that it states when it ends.
 
-        A site (arm controller) states the number in its "end" event. Sites without such an
-        event are left out. A number above that of the scenario is reduced to the number of the
-        scenario.
+        A site states the number in its "end" event. Sites without such an event are left out. A
+        number greater than that of the scenario is reduced to the number of the scenario.
         """
         ticks = {}
         for event in self.events:
@@ -693,11 +688,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Starts of each site (arm controller) that joined the session while it was running.
+        """Maps each site that joined while the session was running to the list of its starts.
 
-        A start is a pair: the first tick (control period), and a random number (boot) that
-        identifies this start of the process. Sites that were present from the beginning and
-        were never started again have no entry.
+        A start is a pair of its first tick and the random number (boot) that identifies this
+        start of the process. Sites that were present from the beginning and never restarted
+        have no entry.
         """
         starts: dict[str, list[tuple[int, int]]] = {}
         for event in self.events:
@@ -709,33 +704,32 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def absences(self) -> dict[str, list[tuple[int, int]]]:
-        """Ticks that a site did not execute, because its process was not running.
+        """Ticks that a site did not execute because its process was not running.
 
-        A tick is one period of the control loop. A process may be killed and started again, or
-        may join a session late. For each start in `starts`, a range (first tick, last tick)
-        ends just before that start. The range begins after the last earlier tick that is known
-        to have been executed. Such a tick is known from a record, from the "end" event of the
-        earlier process, or because another site received the state that was sent in that tick.
+        This happens when a process is killed and restarted, or joins a session late. Each start
+        in `starts` is preceded by a range (first tick, last tick) of such ticks. The range
+        begins after the last earlier tick that is known to have been executed, from a record,
+        from the "end" event of the earlier process, or because another site received the sample
+        sent in that tick.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Finds the ranges of ticks that a site did not execute because it was not running.
 
-        A tick is one period of the control loop. The process may be started again while the
-        session runs. It then joins at a later tick. The absence before a start ends just before
-        its first tick. It begins after the last tick that the earlier process is known to have
-        executed, from one of three sources:
+        A process that is restarted while the session runs joins at a later tick. The absence
+        before a start ends just before its first tick. It begins after the last tick that the
+        earlier process is known to have executed, from one of three sources:
 
-        - a record (the message with the results of one tick),
+        - a record,
         - the "end" event of the earlier process, which states its number of ticks,
         - events of the kind `LAST`, in which the other sites state how many ticks they had
           received before this start.
 
         Args:
-            site: Name of the site, the process that runs one arm.
-            starts: Its starts in ascending order: the first tick, and the boot, the random
-                number that identifies the start.
+            site: Name of the site.
+            starts: Its starts in ascending order, each with its first tick and its boot (the
+                random number that identifies the start).
 
         Returns:
             The absences, as (first tick, last tick), in ascending order.
@@ -775,23 +769,22 @@ class Log(Result, Mapping[str, SiteLog]):
         return absences
 
     def find_unexecuted_ticks(self, site: str) -> list[tuple[int, int]]:
-        """Finds the ticks that a site did not execute, although the session was running.
+        """Finds the ticks that a site did not execute although the session was running.
 
-        These are the ticks (control periods) between two starts of the site (`absences`), and
-        the ticks that the site (arm controller) skipped because it was late, as its records
-        state. The site published nothing in these ticks, so their records and samples do not
-        count as missing.
+        These are the ticks between two starts of the site (`absences`), and the ticks that its
+        records report as skipped because the site was late. The site published nothing in these
+        ticks, so their records and samples do not count as missing.
 
         Args:
             site: Name of the site.
 
         Returns:
-            The ranges, as (first tick, last tick).
+            Ranges (first tick, last tick).
         """
         return [*self.absences.get(site, ()), *self[site].skipped_ranges]
 
     def absent_ticks(self, site: str) -> int:
-        """Counts the control periods (ticks) that a site did not execute during the session.
+        """Counts the ticks that a site did not execute during the session.
 
         The process may have started late or ended early, see `find_unexecuted_ticks`.
 
@@ -803,10 +796,10 @@ class Log(Result, Mapping[str, SiteLog]):
     def expected_ticks(self, site: str) -> int:
         """Returns the number of ticks that a site should have executed in this run.
 
-        The "end" event of the site (arm controller) states that number. Without this event, the
-        ticks (control periods) up to the last record count if the site was lost for good.
-        Otherwise all ticks of the scenario count. Ticks that the site did not execute
-        (`absent_ticks`) are subtracted.
+        The "end" event of the site states this number. Without the event, it is the number of
+        ticks up to the last record if the site was lost for good, and the number of ticks in
+        the scenario otherwise. Ticks that the site did not execute (`absent_ticks`) are
+        subtracted.
         """
         recorded = self[site].last_tick + 1
         ticks = self._stated_ticks.get(site)
@@ -819,7 +812,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def _is_gone(self, site: str) -> bool:
         """Returns True if a site was lost or left, according to the latest event about it.
 
-        Other sites publish such events. The site may have come back after an earlier loss.
+        Such events are published by other sites. The site may have come back after an earlier
+        loss.
         """
         kinds = ("lost", "left", "back", "admit")
         events = [event for event in self.events if event.about == site and event.kind in kinds]
@@ -829,16 +823,13 @@ class Log(Result, Mapping[str, SiteLog]):
         return last.kind in ("lost", "left")
 
     def missing(self, site: str) -> int:
-        """Computes how many records of a site (arm controller) the log lacks.
+        """Returns the number of a site's records that are missing from the log.
 
-        The "end" event of the site states how many ticks (control periods) it executed. If this
-        event is not in the log, only records before the last record can be known to be missing.
+        The "end" event of the site states how many ticks it executed. Without the event, only
+        records before the last one in the log can be known to be missing.
 
         Args:
             site: Name of the site.
-
-        Returns:
-            The number of missing records. It is 0 if no record is known to be missing.
         """
         site_log = self[site]
         after_last = max(0, self._stated_ticks.get(site, 0) - (site_log.last_tick + 1))
@@ -846,11 +837,11 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def last_ticks(self) -> dict[str, int]:
-        """Last tick that each site is known to have executed, by name of the site.
+        """Maps each site to the last tick that it is known to have executed.
 
-        The "end" event of a site (arm controller) states that tick (control period). Without
-        this event, it is the tick of the last record of the site, or of the last sample of the
-        site that another site received, whichever is later. It is -1 if no such tick is known.
+        The "end" event of a site states this tick. Without the event, it is the tick of the
+        site's last record or of its last sample that another site received, whichever is later.
+        -1 if no such tick is known.
         """
         stated = self._stated_ticks
         last_ticks = {}
@@ -886,7 +877,7 @@ class Log(Result, Mapping[str, SiteLog]):
         """Creates the object with all records of one arm that `log[name]` returns.
 
         Raises:
-            LogError: A control period is beyond the length of the scenario.
+            LogError: A tick is beyond the duration of the scenario.
         """
         channel = self._channel(self._topic(site, topics.STATE))
         site_log = SiteLog(
@@ -912,7 +903,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return site_log
 
     def changes(self, site: str) -> dict[int, list[str]]:
-        """Lists the changes of parameters that a site (arm controller) applied during the run.
+        """Lists the parameter changes that a site applied during the run.
 
         The site stores its changes in its records. If a record is missing, its changes are
         taken from the "change" events of the site.
@@ -921,7 +912,7 @@ class Log(Result, Mapping[str, SiteLog]):
             site: Name of the site.
 
         Returns:
-            For each tick (control period) with changes, the changes as JSON texts.
+            Maps each tick with changes to the changes as JSON strings.
         """
         changes = self[site].changes()
         change_events = [event for event in self.events if event.kind == "change"]
@@ -934,19 +925,18 @@ class Log(Result, Mapping[str, SiteLog]):
         return dict(sorted(changes.items()))
 
     def commands(self, site: str) -> dict[int, list[CoreChange]]:
-        """Lists the changes that a site applied, decoded so that the run can be executed again.
+        """Lists the changes that a site applied, decoded so that the run can be repeated.
 
-        `changes` returns the same changes as JSON texts.
+        `changes` returns the same changes as JSON strings.
 
         Args:
-            site: Name of the site (arm controller).
+            site: Name of the site.
 
         Returns:
-            For each tick (control period) with changes, the changes as `Site.step` receives
-            them.
+            Maps each tick with changes to the changes in the form expected by `Site.step`.
 
         Raises:
-            LogError: A text is not a valid change of the scenario.
+            LogError: A JSON string is not a valid change of the scenario.
         """
         commands = {}
         try:
@@ -958,19 +948,19 @@ class Log(Result, Mapping[str, SiteLog]):
         return commands
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Returns the states of the other arms that the user of a site saw on the screen.
+        """Returns which states of the other arms the user of a site saw on the screen.
 
         The user usually sees the state that the control law uses. If the scenario has a table
-        `[sites.NAME.view]`, the picture has its own delay, like a video that arrives later than
-        the control signals. The user then sees the newest state that has arrived with that
-        delay.
+        `[sites.NAME.view]`, the picture has its own delay, like a video stream that arrives
+        later than the control signals. The user then sees the newest state that has arrived
+        with that delay.
 
         Args:
-            site: Name of the user's site (arm controller).
+            site: Name of the user's site.
 
         Returns:
-            For each other arm (peer) the ticks (control periods) of the visible states, one per
-            record of the site, shape (K,). They are -1 before the first state.
+            Maps each peer to the ticks of its visible states, shape (K,), with one entry per
+            record of the site. The tick is -1 before the first state.
         """
         site_log = self[site]
         delayed_pictures = PictureDelay(self.scenario, site).list_shown_samples(
@@ -982,16 +972,16 @@ class Log(Result, Mapping[str, SiteLog]):
         return shown_ticks
 
     def sample_ages_ns(self, peer: str, site: str) -> Ints:
-        """Computes the age of the other arm's state that a control loop used, in every tick.
+        """Computes how old the peer's sample was that a site used in each tick, in ns.
 
-        A state is older than the network delay if the next message is late or lost.
+        The age exceeds the network delay if the next sample is late or lost.
 
         Args:
-            peer: Name of the site that sent the states.
+            peer: Name of the site that sent the samples.
             site: Name of the site that used them.
 
         Returns:
-            The ages, in ns. Ticks before the first state came into use are left out.
+            The ages, in ns. Ticks before the first sample came into use are left out.
         """
         site_log = self[site]
         used = site_log.used[peer]
@@ -1011,15 +1001,14 @@ class Log(Result, Mapping[str, SiteLog]):
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Returns the statistics that a site published about its network links, with times.
+        """Returns a site's network link statistics with their sending and arrival times.
 
         Args:
-            site: Name of the site, the process that runs one arm.
+            site: Name of the site.
 
         Returns:
-            The statistics in the order of their ticks, the periods of the control loop. Each
-            message has the time at which it was sent, and the time at which it arrived at the
-            recorder.
+            The messages in tick order, each with the time at which it was sent and the time at
+            which it arrived at the recorder.
         """
         topic = self._topic(site, topics.LINK)
         stats = self._decode(topic, LinkStats)
@@ -1028,14 +1017,10 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages([stats[n] for n in order], log_ns[order], publish_ns[order])
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Returns the events of all processes of the session, in the order of their arrival.
+        """Returns the events of all processes of the session, in order of arrival.
 
-        An event is a notable occurrence, such as a lost connection. Each has the time of
-        arrival at the recorder and the time of sending.
-
-        Returns:
-            The events, with the time of arrival at the recorder and the time of sending of
-            each.
+        An event is a notable occurrence, such as a lost connection. Each is returned with the
+        time it was sent and the time it arrived at the recorder.
         """
         events: list[Event] = []
         log_times = [np.zeros(0, np.int64)]
@@ -1053,15 +1038,15 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def link_delays(self) -> dict[str, list[TracePoint]]:
-        """Measured delays of the samples of each link, by the name of the link ("m1->s").
+        """Maps the name of each link, such as "m1->s", to the measured delays of its samples.
 
-        A delay is a pair (stamp in s, delay in ms), in the order of the stamps. The stamp of a
-        sample is the nominal time of the tick (control period) in which the sender computed it.
-        The receiver stores the network delay of each sample in the field `rx` of its records
-        (results of control periods). Delays that the scenario injected are not included. A
-        negative delay is an error of the clocks and counts as 0. If a sample arrived twice, the
-        shorter delay counts. A sample counts as sent if the sender has a record of its tick. A
-        lost sample has an infinite delay. The list is empty if no sample arrived over the link.
+        Each delay is a pair (stamp in s, delay in ms), sorted by stamp. The stamp of a sample
+        is the nominal time of the tick in which the sender computed it. The receiver stores the
+        network delay of each sample in the field `rx` of its records. Delays injected by the
+        scenario are not included. A negative delay results from clock errors and counts as 0.
+        If a sample arrived twice, the shorter delay counts. A sample counts as sent if the
+        sender has a record of its tick. A lost sample has an infinite delay. The list is empty
+        if no sample arrived over the link.
         """
         delays = {}
         for site in self.sites:
@@ -1073,23 +1058,22 @@ class Log(Result, Mapping[str, SiteLog]):
         return delays
 
     def recorder_stats(self) -> list[RecorderStats]:
-        """Decodes the statistics that the recorder published about itself while it recorded.
+        """Decodes the statistics that the recorder published about itself while recording.
 
         They show, for example, how many messages of each channel were missing.
 
         Returns:
-            The messages in the order of the file. Empty if the log contains none.
+            The messages, in file order. Empty if the log contains none.
         """
         return self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats)
 
     def table(self, name: str, kind: str = "") -> Table:
-        """Returns a table of the log, such as an arm's records: columns with names and units.
+        """Returns a table of the log, such as an arm's records, with named columns and units.
 
         Args:
-            name: Name of a site (arm controller), or "events".
-            kind: Kind of a site's table: "state" (the default) has a row per record (result of
-                a control period), "link" a row per statistics message, and "arrivals" a row per
-                sample that arrived.
+            name: Name of a site, or "events".
+            kind: Kind of a site's table: "state" (the default) has one row per record, "link"
+                one row per statistics message, and "arrivals" one row per sample that arrived.
 
         Raises:
             UnknownName: The log has no such table.
@@ -1113,7 +1097,7 @@ class Log(Result, Mapping[str, SiteLog]):
     def tables(self) -> Iterator[Table]:
         """Yields every table of the log, such as the joint angles of one arm, for exports.
 
-        The tables of each site come first, then the table of the events. Only one of them is in
+        The tables of the sites come first, then the table of events. Only one table is in
         memory at a time.
         """
         for site in self.sites:
@@ -1124,10 +1108,10 @@ class Log(Result, Mapping[str, SiteLog]):
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
         """Returns a table of the log as a polars data frame.
 
-        `to_frame` returns a pandas data frame.
+        For a pandas data frame, use `to_frame`.
 
         Args:
-            name: Name of a site (arm controller), or "events".
+            name: Name of a site, or "events".
             kind: Kind of a site's table, see `table`.
 
         Raises:
@@ -1144,7 +1128,7 @@ def open_log(
     other_version: bool = False,
     remember: bool = False,
 ) -> Log:
-    """Opens a log in a file, or in several files that are parts of one session.
+    """Opens a log from a single file, or from several files that are parts of one session.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.open_log(path)["m"].t_s[-1]
@@ -1153,17 +1137,17 @@ def open_log(
     Args:
         source: A path, or a binary file opened for reading.
         more: Further parts of the session, in any order.
-        progress: Function that is called repeatedly with the number of bytes read and their
+        progress: Function that is called repeatedly with the number of bytes read and the
             total.
         law: Files of control laws that the log names and that may run when the log is executed,
-            see docs/sessions/code-that-runs.md. Laws that this process has run itself need no
+            see docs/sessions/code-that-runs.md. Laws that this process has already run need no
             permission.
-        other_version: True if these files may have other hashes than the log names.
-        remember: True if these laws may also run for other logs that name their hashes, with
-            the same settings.
+        other_version: True to accept files whose hashes differ from those in the log.
+        remember: True to permit these laws for other logs too, if they name the same hashes and
+            settings.
 
     Raises:
-        UsageError: The log does not name one of the files of `law`.
+        UsageError: One of the files in `law` is not named in the log.
         LogError: A file is missing, is not an MCAP file or is not a log of trilat-net. Also
             raised if the files belong to different sessions or contain different versions of a
             message.
@@ -1174,18 +1158,19 @@ def open_log(
 
 
 def read_link_delays(path: Path, link: str) -> list[TracePoint]:
-    """Returns the measured delays of the samples of a link of a log, see `Log.link_delays`.
+    """Returns the measured delays of the samples of one link in a log, see `Log.link_delays`.
 
     Args:
-        path: The log.
+        path: Path of the log.
         link: Name of the link, such as "m1->s".
 
     Returns:
-        The pairs (stamp in s, delay in ms).
+        Pairs (stamp in s, delay in ms).
 
     Raises:
         OSError: The file cannot be opened.
-        ValueError: The file is not a log, has no such link, or no sample arrived over the link.
+        ValueError: The file is not a log or has no such link, or no sample arrived over the
+            link.
     """
     status = path.stat()  # raises the same errors as opening the file
     links = _read_links(path, status.st_mtime_ns, status.st_size)
@@ -1199,11 +1184,12 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
 @lru_cache(maxsize=1)
 def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[TracePoint]]:  # noqa: ARG001
-    """Measures the network delays of all links of a log, by the name of the link ("m1->s").
+    """Reads the measured network delays of all links of a log.
 
-    The result for the last file is cached, because a scenario reads the links of a log one
-    after another. `modified_ns` and `size` are not used here, but are part of the key of the
-    cache. If the file is written again, they change, and the file is read again.
+    Maps the name of each link ("m1->s") to its delays. The result for the last file is cached,
+    because a scenario reads the links of a log one after another. `modified_ns` and `size` are
+    only used as part of the cache key: if the file is rewritten, they change and the file is
+    read again.
     """
     try:
         return open_log(path).link_delays

@@ -1,14 +1,14 @@
-"""Signs logs, so that anybody can check later that a log was not changed.
+"""Signs logs, so that anyone can later verify that a log has not been changed.
 
 A log contains digests of its contents (`running_digest`). The owner of a private key signs
-these digests with the method Ed25519, and stores the signature in a separate file beside the
-log. Anybody with the public key can check that the log is the one that was signed. A signature
-covers all messages and everything that describes them, but not the compression. It is therefore
-also valid for a copy of the log that was compressed differently.
+these digests with Ed25519 and stores the signature in a separate file next to the log. Anyone
+who has the public key can verify that the log is the one that was signed. A signature covers
+all messages and everything that describes them, but not the compression, so it also holds for a
+copy of the log that was compressed differently.
 
 Invariant:
-    - A log is only read, and never changed.
-    - Only a log that agrees with its digests is signed.
+    - A log is only read, never changed.
+    - Only a log that matches its digests is signed.
 """
 
 import base64
@@ -40,19 +40,19 @@ from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
 
 SUFFIX = ".sig"
-"""Suffix of the signature's file, after the whole name of the log."""
+"""Suffix of the signature file, appended to the full name of the log."""
 _FORMAT = "trilat-net log signature 1"
-"""Name and version of the format, at the beginning of the signed bytes."""
+"""Name and version of the format, at the start of the signed bytes."""
 _MAX_BYTES = 65_536
-"""Largest size of the file of a key or of a signature, in bytes."""
+"""Maximum size of a key file or signature file, in bytes."""
 
 
 class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of the file beside a log that contains its cryptographic signature.
+    """Content of the file next to a log that contains its cryptographic signature.
 
     Attributes:
         format: Name and version of the format.
-        chain: The signed digests, as the log states them.
+        chain: The signed digests, as stated in the log.
         public_key: Public key of the signer, 32 bytes in base64. It is not trusted. The person
             who checks the log supplies the key of a trusted signer.
         signature: The signature, 64 bytes in base64.
@@ -65,19 +65,19 @@ class _LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
-    """Creates a pair of keys for signing logs, as `trilat keys pair` does.
+    """Creates a key pair for signing logs, like `trilat keys pair`.
 
-    The private key is written to PATH.key, which only the user may read. The public key is
-    written to PATH.pub.
+    The private key is written to PATH.key, which only the user may read, and the public key to
+    PATH.pub.
 
     >>> [file.name for file in tn.create_signing_keys("lab")]
     ['lab.key', 'lab.pub']
 
     Args:
-        path: Name of the files without their suffixes.
+        path: Path of the files without the suffix.
 
     Returns:
-        The files of the private and of the public key.
+        Paths of the private and the public key file.
 
     Raises:
         UsageError: One of the files exists, or cannot be written.
@@ -108,25 +108,25 @@ def sign_log(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Signs a finished log, as `trilat log sign` does.
+    """Signs a finished log, like `trilat log sign`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("signed.mcap")
     >>> tn.sign_log(path, tn.create_signing_keys("mine")[0]).name
     'signed.mcap.sig'
 
     Args:
-        path: The log.
-        key_file: File of the private key.
-        force: True if an existing signature may be replaced.
+        path: Path of the log.
+        key_file: Path of the private key file.
+        force: True to allow replacing an existing signature.
         progress: Function that is called after every record of the log.
 
     Returns:
-        The file of the signature.
+        Path of the signature file.
 
     Raises:
-        LogError: The log cannot be read, has no digests, or does not agree with its digests.
-        UsageError: The key file is not a private key, other users can read it, or there is a
-            signature already.
+        LogError: The log cannot be read, has no digests, or does not match its digests.
+        UsageError: The key file is not a private key, other users can read it, or a signature
+            already exists.
     """
     path = Path(path)
     key_file = Path(key_file)
@@ -168,19 +168,18 @@ def sign_log(
 def check_signatures(
     paths: Sequence[Path], key_file: Path, progress: Progress | None = None
 ) -> Finding:
-    """Checks that logs are exactly those that the owner of a public key has signed.
+    """Checks that logs are exactly those signed by the owner of a public key.
 
-    A digest reveals only accidental changes, because anybody can compute it again. A signature
-    shows who vouches for the log.
+    A digest reveals only accidental changes, because anyone can recompute it. A signature shows
+    who vouches for the log.
 
     Args:
-        paths: The logs. The signature of a log is in a file beside it.
-        key_file: File of the public key of a signer whom the user trusts.
-        progress: Function that is called after every record (result of a control period) of a
-            log.
+        paths: Paths of the logs. The signature of each log is in a file next to it.
+        key_file: Path of the public key file of a signer whom the user trusts.
+        progress: Function that is called after every record of a log.
 
     Returns:
-        The result, with a problem for each log whose signature is missing or invalid.
+        A finding with one problem for each log whose signature is missing or invalid.
 
     Raises:
         LogError: A log cannot be read.
@@ -195,14 +194,14 @@ def check_signatures(
         if problem:
             finding.add(str(path), None, problem)
     files = "file is" if len(paths) == 1 else count_nouns(len(paths), "file is", "files are")
-    return finding.conclude(f"the {files} as the owner of {key_file} signed")
+    return finding.conclude(f"the {files} as signed by the owner of {key_file}")
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:
     """Checks that a log has not been changed since it was signed.
 
     Args:
-        path: The log.
+        path: Path of the log.
         key: Public key of the signer.
         progress: Function that is called after every record of the log.
 
@@ -244,31 +243,31 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
 
 
 def _signed_bytes(chain: Mapping[str, str]) -> bytes:
-    """Returns the bytes of a log that are signed, in place of the whole file.
+    """Returns the bytes that are signed to represent a complete log.
 
-    They are the name of the format, and the digests, which depend on every byte of the file.
+    These are the name of the format, and the digests, which depend on every byte of the file.
 
     Args:
-        chain: The digests, as the log states them.
+        chain: The digests, as stated in the log.
     """
     facts = json.dumps(dict(chain), sort_keys=True, separators=(",", ":"))
     return f"{_FORMAT}\n{facts}".encode()
 
 
 def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
-    """Reads a whole log, and compares it with the digests that it states at its end.
+    """Reads a complete log, and compares it with the digests stated at its end.
 
-    Digests are checksums of the contents (`running_digest`), which are computed again while the
-    log is read. A log whose digests agree (`DigestState.INTACT`), but whose end mark is
-    missing, counts as unfinished (`DigestState.OPEN`) and is not signed.
+    Digests are checksums of the contents (`running_digest`), which are recomputed while the log
+    is read. A log whose digests match (`DigestState.INTACT`) but whose end mark is missing
+    counts as unfinished (`DigestState.OPEN`) and is not signed.
 
     Args:
-        path: The log.
+        path: Path of the log.
         progress: Function that is called after every record of the log.
 
     Returns:
-        The result of the comparison, and the stated digests by name. They are empty if the log
-        states none.
+        The result of the comparison, and the digests stated in the log. Empty if there are
+        none.
 
     Raises:
         LogError: The log cannot be read.
@@ -286,10 +285,10 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
 
 
 def _load_key(path: Path, kind: Any, expected: str) -> Any:
-    """Reads a cryptographic key from a file, and checks that it has the expected kind.
+    """Reads a cryptographic key of a given kind from a file.
 
     Args:
-        path: The file.
+        path: Path of the file.
         kind: Class of the key.
         expected: Description of the expected key for the error message.
 

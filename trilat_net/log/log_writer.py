@@ -1,16 +1,16 @@
-"""Writes the log of a session into one MCAP file or into several parts.
+"""Writes the log of a session to a single MCAP file or to several parts.
 
 The parts of run.mcap are called run-001.mcap, run-002.mcap and so on. A part ends when it
-reaches the size or the duration that the user has set.
+reaches the size or the duration set by the user.
 
 Invariant (L5):
-    - Every file can be understood without other files: the session, the scenario and the
-      schemas precede the first message.
-    - The messages are stored byte for byte as they were published.
-    - The numbers of received and missing messages (the accounts) are at the end of the file.
+    - Every file can be understood on its own: the session, the scenario and the schemas precede
+      the first message.
+    - Messages are stored byte for byte as they were published.
+    - The accounts (counts of received and missing messages) are at the end of the file.
     - Each part repeats the session, the scenario and the schemas, and names the previous part.
-    - Each message is in exactly one part, because the writing thread begins a new part between
-      two messages.
+    - Each message is in exactly one part, because the writing thread starts a new part only
+      between two messages.
 """
 
 import glob
@@ -34,30 +34,32 @@ from .session_scenario import SessionScenario
 Decoded = State | TickRecord | LinkStats | Event | None
 """Decoded message, from which messages for viewers are derived. None if no viewer needs it."""
 ReceiveMessage = Callable[[Any, int], None]
-"""Function that receives one message of the session, and its arrival time in Unix ns."""
+"""Function that takes one message of the session and its arrival time in Unix time, in ns."""
 PutMessage = Callable[[str, bytes, int, int], None]
-"""Function that writes one message: topic, bytes, sending and arrival time in Unix ns."""
+"""Function that writes one message, given its topic, bytes, and sending and arrival times in
+Unix time, in ns.
+"""
 
 
 class _ViewChannels(Protocol):
-    """Numbers of the channels for viewers in a file, by topic."""
+    """Maps the topic of each channel for viewers to its number in a file."""
 
     def __getitem__(self, topic: str) -> int:
         """Returns the number of a topic's channel in an MCAP file.
 
-        The channel is registered in the file at the first access, so that the file declares no
+        The channel is registered in the file on first access, so that the file declares no
         channel without messages.
         """
 
 
 class _LogViews(Protocol):
-    """Interface: derives messages for general viewers from the messages of a session.
+    """Protocol for deriving messages for general viewers from the messages of a session.
 
     Viewers such as Foxglove cannot read the program's own format.
-    `ros2.viz_channels.VizChannels` derives standard messages of ROS 2.
+    `ros2.viz_channels.VizChannels` derives standard ROS 2 messages.
 
     Attributes:
-        receivers: Functions that receive the messages of the session, by the key of the
+        receivers: Maps the key of messages of the session to the function that receives these
             messages.
     """
 
@@ -65,7 +67,7 @@ class _LogViews(Protocol):
 
     @property
     def most_bytes(self) -> int:
-        """Upper limit for the size of messages for viewers that are not written yet, in bytes.
+        """Upper bound on the size of viewer messages that are still to be written, in bytes.
 
         A writer adds this size when it decides whether the next message still fits into the
         file.
@@ -77,14 +79,14 @@ class _LogViews(Protocol):
         A channel is registered in the file only when its first message is written.
 
         Args:
-            file: The file.
+            file: Writer of the MCAP file.
         """
 
     def finish(self, log_ns: int) -> None:
-        """Writes the remaining messages for viewers such as Foxglove, at the end of the log.
+        """Writes the remaining messages for viewers such as Foxglove at the end of the log.
 
         Args:
-            log_ns: Arrival time of the last message of the session, in Unix time, in ns.
+            log_ns: Arrival time of the last message of the session in Unix time, in ns.
         """
 
 
@@ -99,27 +101,27 @@ writes a message.
 class LogWriter:
     """Writes the messages of a session, and everything that describes them, to one log file.
 
-    In addition to the messages as they were published, it can write messages for viewers, which
-    are derived from them.
+    Besides the messages as published, it can write messages for viewers that are derived from
+    them.
 
     Args:
-        stream: File or buffer that receives the bytes.
+        stream: File or buffer to write to.
         scenario: Scenario of the session.
         session: Name of the session.
         driver: Kind of time in the session: "live" or "virtual".
-        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
         provenance: Facts about the program that writes the log, see `provenance`.
         facts: Further metadata of the session.
-        part: Metadata of the part, if the log has several files.
-        choice: Filter of the channels that the log contains.
+        part: Metadata of the part, if the log consists of several files.
+        choice: Filter that selects the channels to store in the log.
         make_views: Creates the messages for viewers. If None, the log contains no such
             messages.
 
     Attributes:
-        records_digest: Digest of the messages of a finished log. Empty before the end.
+        records_digest: Digest of the messages of a finished log. Empty until then.
 
     Raises:
-        LogRefused: The disk refused the data.
+        LogRefused: Writing to the disk failed.
     """
 
     def __init__(
@@ -184,10 +186,10 @@ class LogWriter:
         Args:
             scenario: Scenario of the session.
             session: Name of the session.
-            choice: Filter of the channels that the log contains.
+            choice: Filter that selects the channels to store in the log.
 
         Returns:
-            The numbers of the channels in the file, by key. None for excluded channels.
+            Maps the key of each channel to its number in the file, or None if it is excluded.
         """
         # A schema describes the fields of one kind of messages.
         schemas: dict[str, int] = {}
@@ -214,9 +216,9 @@ class LogWriter:
 
     @property
     def ended(self) -> bool:
-        """True if no message can be added: the log is finished, or the disk refused data.
+        """True if no more messages can be added: the log is finished, or a write has failed.
 
-        Messages that arrive later are then missing in this file.
+        Messages that arrive later will be missing from this file.
         """
         return bool(self._end_reason)
 
@@ -227,15 +229,15 @@ class LogWriter:
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes of the log file that have been written so far."""
+        """Number of bytes of the log file written so far."""
         return self._file.position
 
     @property
     def most_bytes(self) -> int:
-        """Largest size of the file if it were finished now, in bytes.
+        """Upper bound on the size of the file if it were finished now, in bytes.
 
-        It shows whether a further message still fits into a part of limited size. The numbers
-        of received and missing messages, which `finish` also writes, are not included.
+        Used to decide whether another message still fits into a part of limited size. The
+        message counts, which `finish` also writes, are not included.
         """
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
@@ -249,18 +251,19 @@ class LogWriter:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one network message to the log, unless the user has excluded its channel.
+        """Adds a network message to the log, unless the user's filter excludes its channel.
 
         Args:
             key: Key of the channel.
             payload: Bytes of the message.
-            t_ns: Sending time after the start of the session, in ns.
-            log_time_ns: Arrival time, in Unix time, in ns.
+            t_ns: Sending time since the start of the session, in ns.
+            log_time_ns: Arrival time in Unix time, in ns.
             number: Sequence number.
             message: The decoded message, if the log contains messages for viewers.
 
         Raises:
-            LogRefused: The disk refused these or earlier data, or the log is finished.
+            LogRefused: Writing to the disk failed, in this call or an earlier one, or the log
+                is already finished.
         """
         if self._end_reason:
             raise LogRefused(self._end_reason)
@@ -284,13 +287,13 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _add_view_message(self, topic: str, data: bytes, publish_ns: int, log_ns: int) -> None:
-        """Adds a message to the log that viewers such as Foxglove display.
+        """Adds a message for viewers such as Foxglove to the log.
 
         Args:
             topic: Topic of the message.
             data: Bytes of the message.
-            publish_ns: Sending time, in Unix time, in ns.
-            log_ns: Arrival time, in Unix time, in ns.
+            publish_ns: Sending time in Unix time, in ns.
+            log_ns: Arrival time in Unix time, in ns.
         """
         publish_ns = min(publish_ns, log_layout.MAX_TIME_NS)
         self._file.add_message(self._view_channels[topic], log_ns, data, publish_ns)
@@ -299,23 +302,24 @@ class LogWriter:
         """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         with self._translate_disk_errors():
             self._file.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the file, so that other programs can read it.
+        """Completes the file so that other programs can read it.
 
-        The numbers of received and missing messages, the index and the end mark are written.
-        The stream stays open. Further calls have no effect.
+        Writes the message counts, the index and the end mark. The stream stays open. Further
+        calls have no effect.
 
         Args:
-            accounts: For each topic a text with its numbers of received and missing messages,
-                and further counts by name. Topics that the log does not record are left out.
+            accounts: Maps each topic to a string with its numbers of received and missing
+                messages, and the names of other counts to their values. Topics that the log
+                does not record are left out.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         if self._end_reason == _FINISHED:
             return
@@ -345,7 +349,7 @@ class LogWriter:
             raise self._end_with_error(error) from None
 
     def _end_with_error(self, error: OSError) -> LogRefused:
-        """Ends the log after an error of the disk, and returns the error to raise."""
+        """Ends the log after a disk error, and returns the error to raise."""
         text = f"the log cannot be written: {error.strerror}; flushed messages are intact"
         self._end_reason = self._end_reason or text
         return LogRefused(text)
@@ -355,26 +359,26 @@ _FINISHED = "the log is finished"
 """Reason why no message can be added to a finished log."""
 
 _ACCOUNTS_BYTES = 16 << 10
-"""Space that is left free in a part of limited size, in bytes.
+"""Space left free in a part of limited size, in bytes.
 
-It is used for the accounts, and for the messages for viewers that follow from one message.
+Reserved for the accounts, and for the viewer messages that result from one message.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class LogStorage:
-    """Path of a log, and the size or duration at which a new file of the log begins.
+    """Path of a log, and the size or duration at which the log continues in a new file.
 
     Attributes:
-        path: Name of the log. The name of a part also contains its number.
-        force: True if the log may replace an existing one.
-        durable: True if the file is forced onto the disk at every flush, so that a loss of
-            power does not damage the log.
-        split_bytes: Largest size of a part, in bytes. None if it is not limited.
-        split_ns: Longest duration of a part, in ns. None if it is not limited.
-        carry_on: True to continue an existing log of this name with a new part. The existing
-            log may be finished or not.
-        choice: Filter of the channels that the log contains.
+        path: Name of the log. The names of its parts also contain a number.
+        force: True to allow replacing an existing log.
+        durable: True to sync the file to the disk at every flush, so that a power failure does
+            not damage the log.
+        split_bytes: Maximum size of a part, in bytes. If None, unlimited.
+        split_ns: Maximum duration of a part, in ns. If None, unlimited.
+        carry_on: True to continue an existing log of this name, finished or not, with a new
+            part.
+        choice: Filter that selects the channels to store in the log.
     """
 
     path: Path
@@ -387,20 +391,20 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """True if a limit of size or duration divides a log into several files.
+        """True if the log is split into several files by a limit on size or duration.
 
         Without a limit, a log has several files only if an existing log was continued.
         """
         return self.split_bytes is not None or self.split_ns is not None
 
     def find_parts(self) -> dict[int, Path]:
-        """Finds the existing files of the log, which may be divided into parts.
+        """Finds the existing files of the log, which may be split into parts.
 
-        Finished files and files that are still being recorded both count.
+        Both finished files and files that are still being recorded are included.
 
         Returns:
-            The files, by the number of the part. A file with the name of the log counts as part
-            1. Empty if there are none.
+            Maps the number of each part to its file. A file with the name of the log counts as
+            part 1. Empty if there are no files.
         """
         parts: dict[int, Path] = {}
         for file in (self.path, log_layout.active_path(self.path)):
@@ -414,14 +418,14 @@ class LogStorage:
         return parts
 
     def find_first_part(self) -> tuple[int, str]:
-        """Decides with which file the writing begins, and checks that its name is free.
+        """Determines which file to write first, and checks that its name is free.
 
         A log may consist of several numbered files, its parts. If an existing log is continued,
-        the new part gets the number after the last part.
+        the new part is numbered after the last one.
 
         Returns:
-            The number of the part, and the name of the previous part. The number is 0 if the
-            log is a single file. The name is empty if there is no previous part.
+            The number of the part (0 if the log is a single file), and the name of the previous
+            part (empty if there is none).
 
         Raises:
             UsageError: A log of this name exists, and neither `force` nor `carry_on` is set.
@@ -449,23 +453,21 @@ class LogStorage:
 
 
 class LogParts:
-    """Writes a log to as many files as its limits of size and duration require.
-
-    It is a context manager.
+    """Context manager that writes a log, split into files according to its limits.
 
     Args:
-        storage: Place of the log, and its division into parts.
-        begin: Function that creates the `LogWriter` of a file, with the metadata of the part.
+        storage: Path of the log and limits on the size and duration of its parts.
+        begin: Function that creates the `LogWriter` of a file, given the metadata of the part.
             The metadata are empty for a log in a single file.
-        opened: Function that opens a file by its path. If None, `LogFile` is used.
+        opened: Function that opens a file, given its path. If None, `LogFile` is used.
 
     Attributes:
-        current_accounts: Function that returns the accounts, which are the numbers of received
-            and missing messages of each topic. They are written at the end of a full part.
+        current_accounts: Function that returns the accounts (counts of received and missing
+            messages of each topic) to write at the end of a full part.
 
     Raises:
         UsageError: The name is in use, or the file cannot be created.
-        LogRefused: The disk refused the data.
+        LogRefused: Writing to the disk failed.
     """
 
     def __init__(
@@ -474,7 +476,7 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
-        """Creates the first of the files into which a long log is divided.
+        """Creates the first file of the log, which may be split into several files.
 
         If a file of the same name exists, an error is raised before anything is created.
         """
@@ -500,12 +502,12 @@ class LogParts:
     def _begin_part(self) -> None:
         """Opens the next file of the log, and writes its beginning.
 
-        A log that is split has several numbered files, its parts. If the beginning cannot be
-        written, the file is removed.
+        A log that is split consists of several numbered files, its parts. If the beginning
+        cannot be written, the file is deleted.
 
         Raises:
             UsageError: The file cannot be created.
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         path = log_layout.part_path(self._storage.path, self._number)
         part_metadata: dict[str, str] = {}
@@ -525,10 +527,10 @@ class LogParts:
         self._previous = path.name
 
     def _begin_next_part(self) -> None:
-        """Finishes the file that is being written, and begins the next file of the same log.
+        """Finishes the current file, and begins the next file of the same log.
 
         Raises:
-            LogRefused: The file cannot be created, or the disk refused the data.
+            LogRefused: The file cannot be created, or writing to the disk failed.
         """
         self._writer.finish(self.current_accounts())
         self._previous_digest = self._writer.records_digest
@@ -544,7 +546,7 @@ class LogParts:
     def _is_part_full(self, payload_bytes: int, duration_ns: int) -> bool:
         """Returns True if the next message would exceed a limit of the current file.
 
-        The limits are those of size and duration at which a log is divided into files.
+        These are the limits on size and duration at which a log is split.
 
         Args:
             payload_bytes: Size of the next message, in bytes.
@@ -564,13 +566,13 @@ class LogParts:
     def path(self) -> Path:
         """Final name of the file that is being written, such as run-002.mcap for part 2.
 
-        While it is written, the file has another name, which ends with ".active".
+        Until it is complete, the file has another name that ends in ".active".
         """
         return self._file.path
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes that have been written to all files of a divided log so far."""
+        """Number of bytes written to all files of the log so far."""
         return self._previous_bytes + self._writer.written_bytes
 
     def add(
@@ -582,20 +584,21 @@ class LogParts:
         number: int,
         message: Decoded = None,
     ) -> None:
-        """Adds one message to the log.
+        """Adds a message to the log.
 
-        If the current part has reached its largest size or duration, a new part is begun first.
+        If the current part has reached its maximum size or duration, a new part is started
+        first.
 
         Args:
             key: Key of the channel.
             payload: Bytes of the message.
-            t_ns: Sending time after the start of the session, in ns.
-            log_time_ns: Arrival time, in Unix time, in ns.
+            t_ns: Sending time since the start of the session, in ns.
+            log_time_ns: Arrival time in Unix time, in ns.
             number: Sequence number of the message.
             message: The decoded message, if the log contains messages for viewers.
 
         Raises:
-            LogRefused: The disk refused these or earlier data.
+            LogRefused: Writing to the disk failed, in this call or an earlier one.
         """
         if self._storage.splits and not self._writer.ended:
             if self._part_start_ns is None:
@@ -609,23 +612,23 @@ class LogParts:
     def flush(self) -> None:
         """Passes all messages so far to the operating system, so that a crash cannot lose them.
 
-        A loss of power can still lose messages, because the operating system writes to the disk
+        A power failure can still lose messages, because the operating system writes to the disk
         later.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         self._writer.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the last file of the log, which then gets its final name.
+        """Completes the last file of the log and gives it its final name.
 
         Args:
-            accounts: Numbers of received and missing messages as a string, by topic, and other
-                counts by name.
+            accounts: Maps each topic to a string with its numbers of received and missing
+                messages, and the names of other counts to their values.
 
         Raises:
-            LogRefused: The disk refused the data.
+            LogRefused: Writing to the disk failed.
         """
         self._writer.finish(accounts)
 

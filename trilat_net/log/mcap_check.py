@@ -1,16 +1,16 @@
 """Checks the bytes of an MCAP file: its checksums, its records and its index.
 
-An MCAP file consists of records. Messages are packed into compressed chunks. The index at the
-end of the file states where the chunks are, and each chunk is followed by an index of its
-messages. This module recomputes all checksums, and builds the index again from the records to
-compare it with the index in the file. Other programs (pymcap-cli doctor) check that a file
-conforms to every rule of the format.
+An MCAP file consists of records. Messages are packed into compressed chunks, each followed by
+an index of its messages, and the index at the end of the file states where the chunks are. This
+module recomputes all checksums, and rebuilds the index from the records to compare it with the
+one in the file. To check that a file conforms to every rule of the format, use another program
+(pymcap-cli doctor).
 
 Invariant:
-    - Each problem is reported once, with its offset. Problems that follow from another problem
+    - Each problem is reported once, with its offset. Problems that result from another problem
       are not reported.
-    - An index is compared with the records in the file, and never used to find them.
-    - Every MCAP file is accepted, not only logs of trilat-net.
+    - An index is compared with the records in the file, but never used to find them.
+    - Any MCAP file is accepted, not only logs of trilat-net.
 """
 
 from array import array
@@ -26,24 +26,23 @@ from . import mcap_records
 from .findings import Findings
 
 _INDEX_HEAD_BYTES = 6
-"""Size of the fields before the entries of a message index, in bytes: channel and length."""
+"""Size of the fields before the entries of a message index (channel and length), in bytes."""
 
 
 class FileCheck:
     """Checks the checksums, the records and the index of one MCAP file.
 
-    The caller reads the file, passes each record to `check_record`, and calls `finish` at the
-    end.
+    The caller reads the file, passes each record to `check_record`, and finally calls `finish`.
 
     Args:
         file: Name of the file.
         scanner: Scanner that finds the records of the file.
-        findings: Results of the checks, to which the problems are added under the names "whole"
-            (damaged or missing parts), "checksums", "records" and "index".
+        findings: Results of the checks. Problems are added under the names "whole" (damaged or
+            missing parts), "checksums", "records" and "index".
 
     Attributes:
-        counts: Numbers of bytes, chunks and messages in the file, and of compared checksums
-            ("crcs").
+        counts: Number of bytes, chunks and messages in the file, and number of checksums that
+            were compared ("crcs").
     """
 
     def __init__(
@@ -76,10 +75,10 @@ class FileCheck:
         self._has_unreadable = False
 
     def check_record(self, record: mcap_records.ScannedRecord) -> None:
-        """Checks one record of the file, and notes how it must appear in the file's index.
+        """Checks one record of the file, and stores how the index must refer to it.
 
-        The index, which is at the end of the file, is compared with these notes when the whole
-        file has been read. Problems are added to the findings.
+        The index is at the end of the file, so the comparison follows when the whole file has
+        been read. Problems are added to the findings.
 
         Args:
             record: The record.
@@ -103,7 +102,7 @@ class FileCheck:
         """Checks one record of the MCAP file with the method for its kind.
 
         Raises:
-            UnreadableRecord: The record cannot be decoded, or its checksum differs.
+            UnreadableRecord: The record cannot be decoded, or its checksum is wrong.
         """
         frame = record.frame
         content = record.content
@@ -128,19 +127,19 @@ class FileCheck:
 
         Metadata and attachments must appear in the index at the end of the file. The entry that
         they must have there is stored in the expected entries. The index entries that are read
-        later are stored in the stated entries. When the whole file has been read,
+        later are stored in the stated entries. When the complete file has been read,
         `_compare_index` compares the two. An entry of a metadata record or an attachment is
         (size of the record, name). An entry of a chunk is (size of the record, first and last
         log time, offsets of the message indexes by channel), see `_check_chunk`. All other
-        records are noted for `_compare_end`.
+        records are stored for `_compare_end`.
 
         Args:
-            frame: Kind and place of the record.
+            frame: Kind and position of the record.
             content: Content of the record.
             record: The decoded content.
 
         Raises:
-            UnreadableRecord: The checksum of an attachment differs.
+            UnreadableRecord: The checksum of an attachment is wrong.
         """
         match frame.opcode:
             case Opcode.METADATA:
@@ -172,11 +171,11 @@ class FileCheck:
     def _define(self, frame: mcap_records.RecordFrame, opcode: int, content: bytes) -> None:
         """Checks the definition of a schema or a channel.
 
-        A definition may be repeated, but must not change. A channel must name a schema that was
-        defined before, or 0 for no schema.
+        A definition may be repeated, but must not change. A channel must refer to a schema that
+        was defined before, or to 0 for no schema.
 
         Args:
-            frame: Place of the record that contains the definition, which may be a chunk.
+            frame: Position of the record that contains the definition, which may be a chunk.
             opcode: Kind of the definition.
             content: Content of the definition.
         """
@@ -203,10 +202,10 @@ class FileCheck:
         Each undefined channel is reported once.
 
         Args:
-            frame: Place of the record that contains the message, which may be a chunk.
+            frame: Position of the record that contains the message, which may be a chunk.
             data: Bytes that contain the message.
             begin: Offset of the message's first byte in `data`.
-            end: Offset of the first byte after the message.
+            end: Offset after the last byte of the message.
 
         Returns:
             The channel and the log time of the message.
@@ -229,19 +228,19 @@ class FileCheck:
         return channel, log_ns
 
     def _check_chunk(self, record: mcap_records.ScannedRecord) -> None:
-        """Checks the records of a chunk, and notes the entries that the index should contain.
+        """Checks the records of a chunk, and stores the entries that the index should contain.
 
-        Two indexes refer to a chunk. A message index of each channel follows the chunk, and is
-        compared with the messages by `_check_message_index`. The entry of the chunk in the
+        Two indexes refer to a chunk. One message index per channel follows the chunk, and is
+        compared with the messages by `_check_message_index`. The entry for the chunk in the
         index of the file states its size and its times, and where these message indexes are.
-        The message indexes are read only after this method. Therefore the expected entry
-        contains a dictionary that `_check_message_index` fills.
+        Since the message indexes are read only after this method, the expected entry contains a
+        dictionary that `_check_message_index` fills.
 
         Args:
             record: The chunk.
 
         Raises:
-            UnreadableRecord: The chunk cannot be unpacked, or contains an invalid record.
+            UnreadableRecord: The chunk cannot be decompressed, or contains an invalid record.
         """
         # If unpacking raises an exception, the message indexes of the chunk are not checked.
         self._message_indexes = None
@@ -273,8 +272,8 @@ class FileCheck:
     def _check_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Compares the index of one channel's messages with the messages of the last chunk.
 
-        A chunk is a compressed block of messages. After the chunk, the file has an index for
-        each channel, which states the time and the offset of each message in the chunk.
+        A chunk is followed by one index per channel, which states the time and the offset of
+        each message in the chunk.
 
         Raises:
             UnreadableRecord: The length of the index is wrong.
@@ -300,8 +299,8 @@ class FileCheck:
     def finish(self) -> None:
         """Reports the damaged parts of the file, and compares its end with the data.
 
-        The end has an index and statistics. The end is compared only if the file was finished
-        and has no damaged part, because otherwise everything would differ.
+        The end holds an index and statistics. It is compared only if the file was finished and
+        has no damaged part, since otherwise everything would differ.
         """
         scanner = self._scanner
         if not scanner.begins:
@@ -322,7 +321,7 @@ class FileCheck:
     def _compare_end(self) -> None:
         """Compares the end of the file, which summarises the data, with the data themselves.
 
-        The end contains an index, the statistics (numbers of records), and checksums.
+        The end contains an index, the statistics (record counts), and checksums.
         """
         if not self._has_unreadable:
             self._compare_index()
@@ -347,8 +346,8 @@ class FileCheck:
     def _compare_index(self) -> None:
         """Compares the index at the end of the file with the records in the file.
 
-        The index need not contain all kinds of records. But if it contains one record of a
-        kind, it must contain all of them.
+        The index may leave out some kinds of records, but if it contains one record of a kind,
+        it must contain all of them.
         """
         indexed_kinds = {opcode for opcode, _ in self._stated_index}
         for (opcode, offset), entry in sorted(self._expected_index.items()):
@@ -366,7 +365,7 @@ class FileCheck:
             self._add("index", offset, text)
 
     def _compare_statistics(self) -> None:
-        """Compares the numbers in the statistics record, if there is one, with the file."""
+        """Compares the counts in the statistics record, if there is one, with the file."""
         if Opcode.STATISTICS not in self._end_records:
             return
         offset, statistics = self._end_records[Opcode.STATISTICS]
@@ -389,7 +388,7 @@ def _sort_by_offset(entries: "bytes | array[int]") -> NDArray[np.uint64]:
     """Returns the pairs (log time, offset) of an MCAP message index, sorted by offset.
 
     Args:
-        entries: Log times and offsets, alternately.
+        entries: Alternating log times and offsets.
     """
     pairs = np.frombuffer(entries, dtype="<u8").reshape(-1, 2)
     return pairs[np.argsort(pairs[:, 1], kind="stable")]

@@ -1,18 +1,19 @@
 """Reads MCAP files chunk by chunk, and collects the messages of a log by topic.
 
 An MCAP file stores messages in compressed chunks. Each message belongs to a channel, which has
-a topic (a name). `McapReader` reads any MCAP file. `LogContents.read` uses it to read a log of
-trilat-net, which contains the messages of a session, completely.
+a topic (a name). `McapReader` reads any MCAP file. `LogContents.read` uses it to load a
+complete log of trilat-net.
 
 Invariant:
-    - The reader has one unpacked chunk in memory at a time. Parts that cannot be read are
-      skipped and reported.
+    - The reader holds one uncompressed chunk in memory at a time. Unreadable parts are skipped
+      and reported.
     - The messages of a log stay encoded until they are needed.
-    - `McapReader.blocks` yields the messages of `McapReader.messages`, in the same order on
-      each channel, and finds the same damage.
-    - Channels that are written for viewers (/viz) are skipped.
-    - The memory is bounded, even if a file was made to do harm. A channel whose messages would
-      need too much memory is read in part. The other channels are read completely.
+    - `McapReader.blocks` yields the same messages as `McapReader.messages`, in the same order
+      within each channel, and finds the same damage.
+    - Channels written for viewers (/viz) are skipped.
+    - Memory is bounded, even if a file was crafted to cause harm. A channel whose messages
+      would need too much memory is read only in part, and the other channels are read
+      completely.
 """
 
 import math
@@ -44,49 +45,52 @@ _READ = {
     Opcode.ATTACHMENT,
     Opcode.HEADER,
 }
-"""Kinds of records that are read. The indexes are not needed to read a whole file."""
+"""Kinds of records that are read. The indexes are not needed to read a complete file."""
 
 KEPT_BYTES = 64 << 20
-"""Memory that the messages of any file may take, in bytes."""
+"""Memory that the messages of any file may use, in bytes."""
 KEPT_RATIO = 300
-"""The messages of a larger file may take this multiple of the size of the file.
+"""For a larger file, the messages may use this multiple of the size of the file.
 
-The largest ratio of logs that trilat-net writes is about 120, for arms at rest in virtual time.
+Among logs written by trilat-net, the largest ratio is about 120, for arms at rest in virtual
+time.
 """
 _CHANNEL_SHARE = 1 / 3
-"""Largest fraction of this memory for one channel."""
+"""Largest fraction of this memory that one channel may use."""
 _DECODED_BYTES = 3_000
 _LONG_BYTES = 300
 _LONG_RATIO = 24
-"""Estimate of the memory of a decoded message: _DECODED_BYTES, and _LONG_RATIO bytes for every
-byte of its payload beyond _LONG_BYTES.
+"""The memory of a decoded message is estimated as _DECODED_BYTES plus _LONG_RATIO bytes for
+each byte of its payload beyond _LONG_BYTES.
 """
 _SKIPPED_BYTES = 100
-"""Estimate of the memory of a message that is not decoded, without its payload."""
+"""Estimated memory of a message that is not decoded, in bytes, excluding its payload."""
 _NAME_BYTES = 600
 _NAME_RATIO = 20
-"""Estimate of the memory of a channel's definition: _NAME_BYTES, and _NAME_RATIO bytes for
-every byte of its record.
+"""The memory of a channel's definition is estimated as _NAME_BYTES plus _NAME_RATIO bytes for
+each byte of its record.
 """
 
 Progress = Callable[[int, int], None]
-"""Function that receives the progress of a task: the processed bytes, and all bytes."""
+"""Function that is called with the progress of a task: the bytes processed so far and the total
+number of bytes.
+"""
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Converts the progress in one of several files to the progress in all of them.
+    """Converts the progress within one of several files to the overall progress.
 
-    Several files are read one after another. The returned function receives the progress in the
-    present file, adds the sizes of the earlier files, and calls `progress`.
+    For files that are read one after another. The returned function takes the progress in the
+    current file, adds the sizes of the earlier files, and calls `progress`.
 
     Args:
-        progress: Function that receives the progress in all files, in bytes. None if the
-            progress is not needed.
-        before: Size of the files that were read before, in bytes.
-        total: Size of all files, in bytes.
+        progress: Function that is called with the overall progress, in bytes. None if progress
+            is not reported.
+        before: Total size of the files already read, in bytes.
+        total: Total size of all files, in bytes.
 
     Returns:
-        The function for the present file. None if `progress` is None.
+        The progress function for the current file, or None if `progress` is None.
     """
     if progress is None:
         return None
@@ -102,8 +106,8 @@ class ChannelInfo(NamedTuple):
         schema: Name of the schema, which describes the fields of the messages. Empty if the
             channel has no schema.
         schema_encoding: Language in which the schema is written.
-        metadata: Further facts about the channel, by name.
-        schema_data: Text of the schema, encoded.
+        metadata: Maps the names of further facts about the channel to their values.
+        schema_data: Encoded text of the schema.
     """
 
     topic: str
@@ -115,13 +119,13 @@ class ChannelInfo(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """One message of an MCAP file, with its channel, times and number, still encoded.
+    """One message of an MCAP file, still encoded, with its channel, times and number.
 
     Attributes:
         topic: Topic of the channel. Empty if the file does not define the channel.
         payload: Bytes of the message, as published.
-        log_time_ns: Time of arrival at the recorder, in Unix time, in ns.
-        publish_time_ns: Time of sending, in Unix time, in ns.
+        log_time_ns: Arrival time at the recorder in Unix time, in ns.
+        publish_time_ns: Sending time in Unix time, in ns.
         sequence: Sequence number of the message, modulo 2^32.
     """
 
@@ -133,16 +137,16 @@ class McapMessage(NamedTuple):
 
 
 class _MessageBlock(NamedTuple):
-    """Several messages of one topic, still in their places in a chunk of an MCAP file.
+    """Several messages of one topic that have not yet been copied out of a chunk.
 
-    A chunk is a block of messages of all topics, which is compressed as a whole. Messages are
-    found and copied in blocks, because compiled code does this much faster than a loop over
-    single messages in Python.
+    A chunk is a block of messages of all topics that is compressed as a unit. Messages are
+    found and copied in blocks, because compiled code does this much faster than a Python loop
+    over single messages.
 
     Attributes:
         topic: Topic of the channel.
-        chunk: The unpacked chunk, or the payload of a single message.
-        run: Places of the messages of all channels in this part of the chunk.
+        chunk: The uncompressed chunk, or the payload of a single message.
+        run: Positions of the messages of all channels in this part of the chunk.
         listed: Number of messages in `run`.
         slot: Index by which `run` identifies the channel.
     """
@@ -160,25 +164,25 @@ class _MessageBlock(NamedTuple):
 
     @property
     def most_bytes(self) -> int:
-        """Upper limit of the total length of the messages in this block, in bytes.
+        """Upper bound on the total length of the messages in this block, in bytes.
 
         A reader reserves this much memory before it copies the messages.
         """
         return int(self.run.lengths[self.slot])
 
     def copy_payloads(self, target: NDArray[np.uint8], offset: int) -> tuple[Ints, Ints]:
-        """Copies the payloads of the K messages one after another into an array.
+        """Copies the payloads of the K messages into an array, one after another.
 
-        It must be called before the reader continues, which reuses the memory of `run`.
+        Call this before the reader continues, because the reader reuses the memory of `run`.
 
         Args:
-            target: Array that receives the payloads.
-            offset: Offset in `target` at which the first payload begins.
+            target: Array to copy the payloads to.
+            offset: Offset in `target` of the first payload.
 
         Returns:
-            The offset in `target` at which each payload ends, shape (K,), and the times of
-            arrival and of sending, in Unix time, in ns, shape (2, K). The times are unsigned
-            numbers in a signed type, so a time of 2^63 ns or later appears negative.
+            The offset in `target` at which each payload ends, shape (K,), and the arrival and
+            sending times in Unix time, in ns, shape (2, K). The times are unsigned integers in
+            a signed type, so a time of 2^63 ns or later appears negative.
         """
         ends = np.zeros(self.messages, np.int64)
         times = np.zeros((2, self.messages), np.int64)
@@ -209,33 +213,33 @@ def _make_single_block(message: McapMessage) -> _MessageBlock:
 
 
 _BLOCK_BYTES = 1 << 12
-"""Smallest size of a chunk whose messages are read in blocks, in bytes."""
+"""Minimum size of a chunk whose messages are read in blocks, in bytes."""
 
 
 class McapReader:
-    """Reads one MCAP file from its beginning to its end, even if the file is damaged.
+    """Reads one MCAP file from start to end, even if the file is damaged.
 
-    `messages` yields the messages one by one, and `blocks` in blocks, which is much faster.
-    `scan` yields the records and the damaged parts of the file, for checking and recovering it.
-    `read_record` yields the messages of a record.
+    `messages` yields the messages one by one, and `blocks` yields them in blocks, which is much
+    faster. To check or recover the file, `scan` yields its records and damaged parts, and
+    `read_record` the messages of a record.
 
     Args:
         stream: The file, opened for reading.
         name: Name of the file for error messages.
         progress: Function that is called after every record of the file.
-        kept: True if the caller stores the messages. The memory for them is then limited, see
+        kept: True if the caller stores the messages. Their memory is then limited, see
             `KEPT_RATIO`.
 
     Attributes:
-        metadata: Metadata read so far, by name.
-        attachments: Attachments read so far, by name.
-        channels: Descriptions of the channels read so far, by topic. If a topic is defined
-            repeatedly, the first definition counts.
-        library: Program that wrote the file, as the header states.
-        chunks: Number of chunks read so far, by compression. The key is empty for chunks that
-            are not compressed.
-        packed_bytes: Size of these chunks in the file, in bytes.
-        unpacked_bytes: Size of these chunks after unpacking, in bytes.
+        metadata: Maps the name of each metadata record read so far to its contents.
+        attachments: Maps the name of each attachment read so far to its contents.
+        channels: Maps the topic of each channel read so far to its description. If a topic is
+            defined repeatedly, the first definition counts.
+        library: Program that wrote the file, according to the header.
+        chunks: Maps each compression to the number of chunks read so far. The key is empty for
+            uncompressed chunks.
+        packed_bytes: Compressed size of these chunks, in bytes.
+        unpacked_bytes: Uncompressed size of these chunks, in bytes.
         size: Size of the file, in bytes.
         offset: Offset of the record that is being read.
         complete: True if the file was finished and has been read completely.
@@ -250,7 +254,7 @@ class McapReader:
         *,
         kept: bool = True,
     ) -> None:
-        """Opens an MCAP file for reading. Only its beginning and its end are read here."""
+        """Opens an MCAP file for reading. Only its beginning and end are read at this point."""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
         self.channels: dict[str, ChannelInfo] = {}
@@ -288,30 +292,30 @@ class McapReader:
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
-        """Unreadable parts among the parts of the file that have been examined.
+        """Unreadable parts of the file found so far.
 
-        A channel of which only some messages were read, because of the memory limit, is listed
-        as well.
+        Also lists a channel that was read only in part because of the memory limit.
         """
         return self.scanner.damaged + self._more_damage
 
     @property
     def torn(self) -> mcap_records.Damage | None:
-        """Unreadable rest of a file whose end is missing, such as a record that is cut off.
+        """Unreadable rest of a file whose end is missing, such as a truncated record.
 
-        The rest extends to the last byte of the file. The value is None if the file ends
-        properly, or if its end has not been reached yet.
+        The rest extends to the last byte of the file. None if the file ends properly, or if its
+        end has not been reached yet.
         """
         return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
-        """Yields every message in the order of the file.
+        """Yields every message in file order.
 
-        A part that cannot be read is added to `damaged`, and reading continues after it, until
-        there are too many damaged parts.
+        An unreadable part is added to `damaged`, and reading continues after it unless there
+        are too many damaged parts.
 
         Raises:
-            LogError: The file is no MCAP file, or unpacks to far too much for its size.
+            LogError: The file is not an MCAP file, or its uncompressed size is out of
+                proportion to its size.
         """
         self._check_begin()
         for item in self._walk():
@@ -325,15 +329,16 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[_MessageBlock]:
-        """Yields the messages of some topics in blocks of many messages, which is faster.
+        """Yields the messages of selected topics in large blocks.
 
-        `messages` finds the same messages one by one.
+        Finds the same messages as `messages`, but is faster than yielding them one by one.
 
         Args:
-            topic_is_kept: Function that decides whether the messages of a topic are yielded.
+            topic_is_kept: Function that returns True for the topics whose messages are wanted.
 
         Raises:
-            LogError: The file is no MCAP file, or unpacks to far too much for its size.
+            LogError: The file is not an MCAP file, or its uncompressed size is out of
+                proportion to its size.
         """
         self._check_begin()
         is_kept = cache(topic_is_kept)
@@ -346,7 +351,7 @@ class McapReader:
                 self._note_damage(item.frame, error)
 
     def _check_begin(self) -> None:
-        """Checks that the file begins with the eight bytes with which every MCAP file begins.
+        """Raises LogError unless the file begins with the magic bytes of MCAP.
 
         Raises:
             LogError: The file begins with other bytes, and is therefore not an MCAP file.
@@ -358,7 +363,7 @@ class McapReader:
     def scan(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, see `RecordScanner.scan`.
 
-        The file may begin with any bytes, and is scanned to its end. The caller passes each
+        The file may begin with any bytes, and is scanned to its end. The caller must pass each
         record to `read_record`, even if it does not need the messages, because `read_record`
         collects the metadata and the digests of the file. After too many damaged parts,
         `read_record` does nothing.
@@ -369,8 +374,8 @@ class McapReader:
     def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, and reports the progress.
 
-        The progress is reported when the generator continues, that is, after the caller has
-        handled a record.
+        Progress is reported when the generator resumes, that is, after the caller has handled a
+        record.
         """
         for item in self.scanner.scan():
             if isinstance(item, mcap_records.Damage):
@@ -388,14 +393,14 @@ class McapReader:
     def read_record(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
         """Yields the messages in a record, and stores its metadata, attachments or definitions.
 
-        Callers use it with `scan`, if they need the records and the messages of a file. A
+        Used with `scan` by callers that need both the records and the messages of a file. A
         record that cannot be read is added to `damaged`.
 
         Args:
             record: The next record of the file.
 
         Raises:
-            LogError: The file unpacks to far too much for its size.
+            LogError: The uncompressed size of the file is out of proportion to its size.
         """
         if record.frame.opcode not in _READ or self._gave_up:
             return
@@ -408,7 +413,7 @@ class McapReader:
         """Adds a record that cannot be decoded to the list of damaged parts of the file.
 
         Args:
-            frame: Place of the record.
+            frame: Position of the record.
             error: The reason.
         """
         # The scanner stops if its own list is too long. A scan must continue to the end of the
@@ -420,28 +425,28 @@ class McapReader:
     def _gave_up(self) -> bool:
         """True if the reader has stopped because the file has too many damaged parts.
 
-        The limit bounds the time and the memory that a file of random bytes can cost.
+        This limits the time and memory that a file of random bytes can cost.
         """
         return self._is_scanned and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
     def _unpack(self, record: mcap_records.ScannedRecord) -> bytes:
         """Processes a record of the file, and returns the messages and definitions in it.
 
-        The action depends on the kind of the record:
+        The action depends on the kind of record:
 
-        - A chunk, a compressed block of messages and definitions, is counted and unpacked.
+        - A chunk, a compressed block of messages and definitions, is counted and decompressed.
         - A message or definition outside of chunks is returned in the same format as in a
           chunk.
-        - Metadata, attachments and the header are stored in the attributes of the reader. They
-          contain no messages. This method adds them to the digest, the checksum that is
-          compared with the one in the file. `_read_messages` adds the returned messages and
-          definitions.
+        - Metadata, attachments and the header contain no messages. They are stored in the
+          attributes of the reader and added to the digest, the checksum that is compared with
+          the one in the file. `_read_messages` adds the returned messages and definitions to
+          the digest.
 
         Args:
             record: The record, of a kind in `_READ`.
 
         Returns:
-            The messages and definitions, with the head of each. Empty if there are none.
+            The messages and definitions, each with its header. Empty if there are none.
 
         Raises:
             UnreadableRecord: The record cannot be decoded, or its checksum is wrong.
@@ -477,7 +482,7 @@ class McapReader:
         return b""
 
     def _read_messages(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
-        """Yields the messages in a record of the file, and stores definitions in it.
+        """Yields the messages in a record of the file, and stores the definitions in it.
 
         The definitions are schemas (formats of messages) and channels (topics).
 
@@ -485,7 +490,7 @@ class McapReader:
             record: The record, of a kind in `_READ`.
 
         Raises:
-            UnreadableRecord: The record makes no sense.
+            UnreadableRecord: The record is invalid.
             LogError: The messages need too much memory.
         """
         yield from self._read_remaining_messages(
@@ -497,14 +502,14 @@ class McapReader:
     ) -> Iterator[McapMessage]:
         """Yields the messages of a record that have not been read yet.
 
-        Messages and definitions are added to the digests. The local variables make this loop
-        fast, which runs for every message of a file.
+        Messages and definitions are added to the digests. Local variables speed up this loop,
+        which runs for every message of a file.
 
         Args:
             partly_read: The record, and how far it has been read.
 
         Raises:
-            UnreadableRecord: The record makes no sense.
+            UnreadableRecord: The record is invalid.
             LogError: The messages need too much memory.
         """
         frame = partly_read.frame
@@ -554,7 +559,7 @@ class McapReader:
         """Stores the definition of a schema or channel that lies between the messages.
 
         The messages before the definition are added to the digest (checksum) of all messages,
-        which leaves out the definitions.
+        which excludes definitions.
 
         Args:
             partly_read: The record, and how far it has been read.
@@ -577,11 +582,10 @@ class McapReader:
     def _finish_record(
         self, partly_read: "_PartlyReadRecord", messages: int, memory: int
     ) -> None:
-        """Concludes the reading of a record after all of its messages have been read.
+        """Finishes reading a record after all of its messages have been read.
 
         The messages after the last definition are added to the digest (checksum) of all
-        messages, and the memory of all messages is subtracted from the memory that may still be
-        used.
+        messages, and the memory of all messages is subtracted from what may still be used.
 
         Args:
             partly_read: The record, and how far it has been read.
@@ -600,13 +604,13 @@ class McapReader:
         """Yields the messages of a record in blocks, and stores its schemas and channels.
 
         Compiled code (`walk_messages`) finds the messages up to the next definition of a schema
-        or channel. The definition is then read, and the search continues after it. If compiled
-        code cannot continue, or if the record is short, the remaining messages are read one by
-        one.
+        or channel. The definition is then read, and the search continues after it. If the
+        compiled code cannot continue, or if the record is short, the remaining messages are
+        read one by one.
 
         Args:
             record: The record, of a kind in `_READ`.
-            is_kept: Function that decides whether the messages of a topic are yielded.
+            is_kept: Function that returns True for the topics whose messages are wanted.
 
         Raises:
             UnreadableRecord: The record cannot be decoded.
@@ -642,10 +646,10 @@ class McapReader:
                 yield _make_single_block(message)
 
     def _clear_run(self) -> chunk_walk.MessageRun:
-        """Returns the arrays that receive the next messages of a chunk, with counts of zero.
+        """Returns the output arrays for the next messages of a chunk, with all counts at 0.
 
-        A chunk is a compressed block of messages. The large arrays are reused. There is a count
-        for each slot, a small number that stands for a channel.
+        The large arrays are reused. There is one count per slot, a small integer that
+        represents a channel.
         """
         sums = np.zeros((4, len(self._slots)), np.int64)
         self._run = self._run._replace(
@@ -656,17 +660,17 @@ class McapReader:
     def _reserve_run_memory(
         self, partly_read: "_PartlyReadRecord", run: chunk_walk.MessageRun
     ) -> bool:
-        """Reserves memory for some messages, unless a channel would exceed its limit.
+        """Reserves memory for several messages, unless a channel would exceed its limit.
 
-        The limit protects against files that were made to exhaust the memory. Messages of the
-        session need more memory than others, because they will be decoded.
+        The limit protects against files crafted to exhaust the memory. Messages of the session
+        need more memory than others, because they will be decoded.
 
         Args:
-            partly_read: The record that contains the messages. The memory is added to it.
+            partly_read: The record that contains the messages, to which the memory is charged.
             run: The messages, counted by channel.
 
         Returns:
-            True if the memory was reserved. False, without a change, if a channel needs too
+            True if the memory was reserved. False, with nothing changed, if a channel needs too
             much memory.
         """
         counts = run.counts.tolist()
@@ -695,15 +699,15 @@ class McapReader:
         run: chunk_walk.MessageRun,
         is_kept: Callable[[str], bool],
     ) -> Iterator[_MessageBlock]:
-        """Yields the messages that were found in a chunk as one block per channel.
+        """Yields the messages found in a chunk as one block per channel.
 
         The blocks are in the order in which the first message of each channel appears.
 
         Args:
-            chunk: The unpacked chunk.
+            chunk: The uncompressed chunk.
             count: Number of messages that were found.
-            run: Places of these messages. It refers to each channel by a small index (slot).
-            is_kept: Function that decides whether the messages of a topic are yielded.
+            run: Positions of these messages. Channels are identified by small indices (slots).
+            is_kept: Function that returns True for the topics whose messages are wanted.
         """
         used_slots = np.flatnonzero(run.counts)
         by_first_message = np.argsort(run.firsts[used_slots])
@@ -713,7 +717,7 @@ class McapReader:
                 yield _MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
-        """Determines from the digests in a file whether the file was changed later.
+        """Determines from the digests in the file whether the file was modified later.
 
         The file must have been read to its end.
 
@@ -726,10 +730,10 @@ class McapReader:
 
     @property
     def agrees_on_messages(self) -> bool:
-        """True if the messages have not been changed since the file was written.
+        """True if the messages have not changed since the file was written.
 
-        The file contains digests, checksums of its contents. The digest of the messages, in
-        their order, and the number of messages are compared with those that were read.
+        Compares the number of messages read, and the digest of these messages in order, with
+        the number and digest stored in the file.
         """
         stated = self.metadata.get(DIGESTS, {})
         computed = self._chain.facts()
@@ -738,7 +742,7 @@ class McapReader:
     def _define(self, opcode: int, content: bytes) -> None:
         """Stores the definition of a schema or a channel.
 
-        A schema describes the fields of a kind of messages, and a channel is a sequence of such
+        A schema describes the fields of a kind of message, and a channel is a sequence of such
         messages. If the file defines the same number twice, the first definition counts.
 
         Raises:
@@ -779,8 +783,8 @@ class McapReader:
     def _drop_slot(self, topic: str) -> None:
         """Makes `blocks` read the messages of a topic one by one instead of in blocks.
 
-        This keeps their order if the topic has several channels. The compiled code then has no
-        number (slot) for the channel, and stops at its messages.
+        This preserves their order if the topic has several channels. The compiled code then has
+        no number (slot) for the channel, and stops at its messages.
 
         Args:
             topic: The topic.
@@ -792,11 +796,11 @@ class McapReader:
     def _stop_reading_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
         """Stops reading a channel because its messages need too much memory.
 
-        This is reported once as a damaged part of the file.
+        Reported once, as a damaged part of the file.
 
         Args:
             channel: Number of the channel.
-            frame: The first record of which the messages of the channel are not read.
+            frame: The first record from which no messages of the channel are read.
         """
         is_stopped_already = self._channel_memory_left[channel] < 0.0
         if is_stopped_already:
@@ -812,8 +816,8 @@ class McapReader:
     def _reserve_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
         """Subtracts an amount from the memory that the contents of this file may still use.
 
-        The limit is a multiple of the size of the file. It protects against small files that
-        were made to fill the memory when they are unpacked.
+        The limit is a multiple of the size of the file. It protects against small files crafted
+        to fill the memory when they are decompressed.
 
         Args:
             amount: Memory in bytes.
@@ -839,11 +843,11 @@ class _PartlyReadRecord:
     """A record of an MCAP file that contains messages, and how far it has been read.
 
     Attributes:
-        frame: Kind and place of the record in the file.
-        data: Messages and definitions of the record, unpacked.
+        frame: Kind and position of the record in the file.
+        data: Uncompressed messages and definitions of the record.
         offset: Offset in `data` up to which they have been read.
         digested: Offset in `data` up to which they have been added to the digest (checksum).
-        messages: Number of messages that have been read.
+        messages: Number of messages read so far.
         memory: Memory that these messages need, in bytes.
     """
 
@@ -856,19 +860,19 @@ class _PartlyReadRecord:
 
 
 _LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
-"""Latest time stamp that fits into a signed number of 64 bits."""
+"""Latest time stamp that fits into a signed 64-bit integer, in ns."""
 
 
 _FIRST_BYTES = 1 << 12
-"""Room for the messages of a topic at the beginning, in bytes."""
+"""Initial space for the messages of a topic, in bytes."""
 
 
 class ChannelMessages:
-    """All messages of one topic in a log, still encoded, in the order of the file.
+    """All messages of one topic in a log, still encoded, in file order.
 
     Attributes:
-        log_ns: Time of arrival of each of the K messages at the recorder, in Unix time, in ns.
-        publish_ns: Time of sending that each message states, in Unix time, in ns.
+        log_ns: Arrival time of each of the K messages at the recorder in Unix time, in ns.
+        publish_ns: Sending time stated by each message in Unix time, in ns.
     """
 
     def __init__(self) -> None:
@@ -883,7 +887,7 @@ class ChannelMessages:
 
     @property
     def payloads(self) -> PackedMessages:
-        """The contents of all K messages of the topic, as they were published.
+        """The payloads of all K messages of the topic, as published.
 
         Messages that are added to the topic later are not included.
         """
@@ -893,21 +897,21 @@ class ChannelMessages:
         return PackedMessages(data[: self._size + PADDING], starts, ends)
 
     def payload(self, number: int) -> bytes:
-        """Returns the content of one message of the topic, as it was published.
+        """Returns the payload of one message of the topic, as published.
 
         Args:
-            number: Number of the message, from 0.
+            number: Number of the message, counted from 0.
         """
         start = self._ends[number - 1] if number else 0
         return self._data[start : self._ends[number]].tobytes()
 
     def _reserve(self, size: int) -> NDArray[np.uint8]:
-        """Returns the array with the contents of all messages, with room for more at its end.
+        """Returns the array with the payloads of all messages, with space for more at its end.
 
-        The array grows at least twofold, so that many small additions stay cheap.
+        The array at least doubles whenever it grows, which keeps many small additions cheap.
 
         Args:
-            size: Number of further bytes.
+            size: Number of additional bytes.
         """
         needed = self._size + size
         if needed > len(self._data):
@@ -917,12 +921,14 @@ class ChannelMessages:
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Appends a message to the messages of the topic, in the order of the file.
+        """Appends a message to those of the topic.
+
+        Messages must be added in file order.
 
         Args:
             payload: The message, encoded as published.
-            log_ns: Time of arrival at the recorder, in Unix time, in ns.
-            publish_ns: Time of sending, in Unix time, in ns.
+            log_ns: Arrival time at the recorder in Unix time, in ns.
+            publish_ns: Sending time in Unix time, in ns.
         """
         data = self._reserve(len(payload))
         end = self._size + len(payload)
@@ -933,7 +939,7 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def add_block(self, block: _MessageBlock) -> None:
-        """Appends a block of messages to those of the topic, in the order of the file."""
+        """Appends a block of messages to those of the topic. Blocks must come in file order."""
         data = self._reserve(block.most_bytes)
         ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
         self._size = int(ends[-1])
@@ -943,36 +949,35 @@ class ChannelMessages:
         self.publish_ns.frombytes(publish_ns.tobytes())
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the arrival and sending times of the topic's K messages, as arrays.
+        """Returns the arrival and sending times of the topic's K messages as arrays, in ns.
 
         Returns:
-            The times of arrival and of sending, shape (K,) each, in Unix time, in ns. A time of
-            2^63 ns or later is replaced by the latest time that the arrays can contain.
+            The arrival times and the sending times in Unix time, each of shape (K,). A time of
+            2^63 ns or later is replaced by the largest value that fits.
         """
         return _clip_times(self.log_ns), _clip_times(self.publish_ns)
 
 
 def _clip_times(times: "array[int]") -> NDArray[np.int64]:
-    """Converts unsigned times to signed times. Times that are too late are reduced."""
+    """Converts unsigned times to signed times, clipping those that are too late."""
     unsigned = np.array(times, dtype=np.uint64)
     return np.minimum(unsigned, _LAST_SIGNED_NS).astype(np.int64)
 
 
 @dataclass
 class LogContents:
-    """Everything in a log, from one file or several, before its messages are decoded.
+    """Everything in a log, from one or several files, before its messages are decoded.
 
     Attributes:
         sources: Names of the files.
         session: Metadata of the session, such as its name and its start time.
-        scenario: Text of the scenario, encoded.
-        metadata: All metadata, by name.
-        channels: The messages, by topic.
+        scenario: Encoded text of the scenario.
+        metadata: Maps the name of each metadata record to its contents.
+        channels: Maps each topic to its messages.
         complete: True if all parts are present and finished, and can be read completely.
         ended: True if the last part was finished.
-        damaged: A sentence for every part of a file that cannot be read.
-        chain: Whether the log agrees with its digests, the checksums that reveal changes. For
-            several files, the worst result.
+        damaged: One sentence for each part of a file that cannot be read.
+        chain: Whether the log matches its digests. For several files, the worst result.
     """
 
     sources: tuple[str, ...]
@@ -1002,15 +1007,15 @@ class LogContents:
         *,
         trusted: bool = False,
     ) -> "LogContents":
-        """Reads everything in one file of a log into memory, without decoding the messages.
+        """Reads everything in a log file into memory, without decoding the messages.
 
         Args:
             stream: The file, opened for reading.
             name: Name of the file for error messages.
             progress: Function that is called after every record of the file.
-            trusted: True if this program has just written the file. The memory for the messages
-                is then not limited. The limit protects against files that were made to do harm,
-                but a file in which arms hardly move may exceed it, because it is compressed so
+            trusted: True if this program has just written the file. Memory for the messages is
+                then unlimited. The limit protects against files crafted to cause harm, but a
+                harmless file in which arms hardly move may exceed it, because it compresses so
                 well.
 
         Raises:
@@ -1039,7 +1044,7 @@ class LogContents:
 
     @staticmethod
     def check(stream: BinaryIO, name: str) -> None:
-        """Reads a log once without storing its messages, to find out whether it can be opened.
+        """Reads a log once, without storing its messages, to find out whether it can be opened.
 
         A log of any length can be checked with little memory.
 
@@ -1048,7 +1053,7 @@ class LogContents:
             name: Name of the file for error messages.
 
         Raises:
-            LogError: The file cannot be opened as a log. The text states the reason.
+            LogError: The file cannot be opened as a log. The message states the reason.
         """
         reader = McapReader(stream, name)
         # Reads all messages, but stores no message.
@@ -1069,10 +1074,10 @@ def _is_log_topic(topic: str) -> bool:
 
 
 def _check_head(reader: McapReader, name: str) -> None:
-    """Checks that an MCAP file is a log of trilat-net: it must describe a session.
+    """Raises LogError unless an MCAP file is a log of trilat-net, which describes a session.
 
     Args:
-        reader: Reader that has read the whole file.
+        reader: Reader that has read the complete file.
         name: Name of the file for the error message.
 
     Raises:

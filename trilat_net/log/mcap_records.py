@@ -1,14 +1,14 @@
 """Finds and decodes the records of MCAP files, including damaged files.
 
-An MCAP file is a sequence of records. A record is an opcode (1 byte), the length of its content
-(8 bytes) and the content, see the specification at mcap.dev. A chunk is a record whose content
-is a sequence of compressed records. The `mcap` package decodes the content of the other
-records.
+An MCAP file is a sequence of records. A record consists of an opcode (1 byte), the length of
+its content (8 bytes) and the content, as specified at mcap.dev. A chunk is a record whose
+content is a sequence of compressed records. All other record contents are decoded by the `mcap`
+package.
 
 Invariant:
-    - No number in a file is trusted. Nothing outside the file is read. A chunk is unpacked only
-      if its head agrees with its data, and only up to a size that is reasonable for its
-      compressed size.
+    - No number in a file is trusted. Nothing outside the file is read. A chunk is decompressed
+      only if its header is consistent with its data, and only up to a size that is plausible
+      for its compressed size.
     - Every function raises `UnreadableRecord` for bytes that are not a valid record.
     - After such bytes, the scan of a file continues at the next readable chunk.
 """
@@ -32,34 +32,38 @@ from mcap.opcode import Opcode
 from ..errors import count_nouns
 
 MAGIC = b"\x89MCAP0\r\n"
-"""Mark at the beginning and at the end of every file."""
+"""Magic bytes at the beginning and end of every file."""
 RECORD_HEAD = struct.Struct("<BQ")
-"""Head of a record before its content: opcode and length of the content."""
+"""Header that precedes the content of a record: opcode and length of the content."""
 RECORD_HEAD_BYTES = RECORD_HEAD.size
-"""Size of the head of a record, in bytes."""
+"""Size of the header of a record, in bytes."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""Head of a message before its payload: channel, sequence, log time, publish time."""
+"""Header that precedes the payload of a message: channel, sequence, log time, publish time."""
 OP_MESSAGE = int(Opcode.MESSAGE)
-"""Opcode of a message, as an int, because members of an enumeration compare slowly."""
+"""Opcode of a message as an int, because comparing members of an enumeration is slow."""
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
-"""Kinds of the records that define schemas and channels."""
+"""Kinds of records that define schemas and channels."""
 _FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
-"""Size of a finished file's footer and end mark, in bytes."""
+"""Size of the footer and end mark of a finished file, in bytes."""
 MAX_DAMAGED_PARTS = 100
-"""Number of damaged parts of a file after which reading is given up."""
+"""Number of damaged parts after which reading of a file is abandoned."""
 
 MAX_UNPACKED_BYTES = 32 << 20
-"""Size to which any chunk may unpack, in bytes."""
+"""Uncompressed size that is accepted for any chunk, in bytes."""
 MAX_UNPACKED_RATIO = 32
-"""Large chunks may unpack to this multiple of their compressed size, if that is more."""
+"""For large chunks, uncompressed sizes up to this multiple of the compressed size are accepted,
+if that is more.
+"""
 MAX_WINDOW_BYTES = 32 << 20
-"""Largest window that a Zstandard frame may require, in bytes."""
+"""Largest window size that a Zstandard frame may require, in bytes."""
 _COMPRESSIONS = (b"zstd", b"lz4")
-"""Supported compressions of chunks. Chunks may also be uncompressed."""
+"""Supported compression methods for chunks. Chunks may also be uncompressed."""
 _COMPRESSION_NAME_OFFSET = 28
-"""Offset of the compression's name, with its length before it, in the content of a chunk."""
+"""Offset in the content of a chunk of the name of the compression method, which is preceded by
+its length.
+"""
 _MAX_HEAD_BYTES = _COMPRESSION_NAME_OFFSET + 4 + 32 + 8
-"""Largest size of a chunk's head, with a compression name of at most 32 bytes."""
+"""Maximum size of a chunk's header, for a compression name of at most 32 bytes."""
 
 # Fields of a chunk's head: first log time, last log time, unpacked size, checksum, and the
 # length of the compression's name. The name and the compressed size follow.
@@ -74,9 +78,9 @@ _COMPRESSION_NAME = re.compile(
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """Error: a part of an MCAP file cannot be read. The text of the error states the reason.
+    """Raised if a part of an MCAP file cannot be read. The message states the reason.
 
-    It is used only within the package `log`: a scan catches it and continues at the next
+    Used only within the package `log`: a scan catches the error and continues at the next
     readable part, and a check reports it.
     """
 
@@ -87,8 +91,8 @@ class ChunkHead(NamedTuple):
     Attributes:
         start_ns: Arrival time of the earliest message in the chunk, in ns.
         end_ns: Arrival time of the latest message in the chunk, in ns.
-        size: Size of the unpacked records, in bytes.
-        crc: CRC-32 checksum of the unpacked records. It is 0 if there is no checksum.
+        size: Size of the uncompressed records, in bytes.
+        crc: CRC-32 checksum of the uncompressed records; 0 if there is no checksum.
         compression: Name of the compression method. Empty if the records are not compressed.
         data_offset: Offset of the compressed records in the content of the chunk, in bytes.
     """
@@ -102,14 +106,14 @@ class ChunkHead(NamedTuple):
 
     @classmethod
     def parse(cls, content: bytes, length: int) -> "ChunkHead":
-        """Decodes the head of a chunk (compressed block of messages), and checks its lengths.
+        """Decodes the header of a chunk, and checks that its lengths are consistent.
 
         Args:
-            content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
-            length: Length of the whole content, in bytes.
+            content: Content of the chunk, or at least its first `_MAX_HEAD_BYTES` bytes.
+            length: Length of the complete content, in bytes.
 
         Raises:
-            UnreadableRecord: The head is incomplete or contradicts the length.
+            UnreadableRecord: The header is incomplete or contradicts the length.
         """
         try:
             start_ns, end_ns, size, crc, name_bytes = _FIXED_HEAD.unpack_from(content)
@@ -137,19 +141,19 @@ class ChunkHead(NamedTuple):
 
 
 def unpack_chunk(content: bytes) -> bytes:
-    """Unpacks the compressed records of a chunk, and checks them against its head.
+    """Decompresses the records of a chunk, and checks them against its header.
 
-    The head may be wrong. Therefore at most its stated size is unpacked, within reasonable
-    limits.
+    Since the header may be wrong, at most the stated size is decompressed, and only within
+    reasonable limits.
 
     Args:
-        content: Content of the chunk: its head and the compressed records.
+        content: Content of the chunk, consisting of its header and the compressed records.
 
     Returns:
-        The unpacked records.
+        The uncompressed records.
 
     Raises:
-        UnreadableRecord: The chunk cannot be unpacked, or its size or its checksum is wrong.
+        UnreadableRecord: The chunk cannot be decompressed, or its size or checksum is wrong.
     """
     head = ChunkHead.parse(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
@@ -172,13 +176,13 @@ def unpack_chunk(content: bytes) -> bytes:
 
 
 def _unpack(head: ChunkHead, data: memoryview) -> bytes:
-    """Decompresses the records of a chunk, a compressed block of messages.
+    """Decompresses the records of a chunk.
 
-    The memory is bounded by the size that the head of the chunk states, even if damaged data
+    The memory is limited to the size stated in the header of the chunk, even if damaged data
     would decompress to more.
 
     Raises:
-        UnreadableRecord: The data are damaged, or the compression is not supported.
+        UnreadableRecord: The data are damaged, or the compression method is not supported.
     """
     try:
         if head.compression == "zstd":
@@ -208,15 +212,14 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray, offset: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Finds the records in an unpacked chunk, one after another, without decoding them.
+    """Finds the records in an uncompressed chunk one after another, without decoding them.
 
     Args:
-        data: The unpacked chunk.
+        data: The uncompressed chunk.
         offset: Offset of the first record to find.
 
     Yields:
-        The number of the record's kind, the offset of its content, and the offset after its
-        content.
+        The opcode of the record, the offset of its content, and the offset after its content.
 
     Raises:
         UnreadableRecord: The last record is incomplete.
@@ -240,7 +243,7 @@ class RecordFrame(NamedTuple):
 
     Attributes:
         offset: Offset of the record's first byte in the file.
-        opcode: Number of the kind of record, such as chunk or metadata.
+        opcode: Identifies the kind of record, such as chunk or metadata.
         length: Length of the record's content, in bytes.
     """
 
@@ -250,12 +253,12 @@ class RecordFrame(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Size of a whole MCAP record in bytes: opcode, length field and content."""
+        """Total size of the MCAP record in bytes: opcode, length field and content."""
         return RECORD_HEAD_BYTES + self.length
 
     @property
     def end(self) -> int:
-        """Offset in the file of the first byte after this record, where the next one begins."""
+        """Offset of the first byte after this record, where the next record begins."""
         return self.offset + self.size
 
 
@@ -279,14 +282,14 @@ class Damage(NamedTuple):
 
 
 class ScannedRecord:
-    """A record that was found in an MCAP file, whose content is read only when needed.
+    """A record found in an MCAP file, whose content is read only when needed.
 
     Args:
-        scanner: Scanner that has found the record.
-        frame: Kind and place of the record.
+        scanner: Scanner that found the record.
+        frame: Kind and position of the record.
 
     Attributes:
-        frame: Kind and place of the record.
+        frame: Kind and position of the record.
     """
 
     __slots__ = ("_content", "_problem", "_scanner", "_unpacked", "frame")
@@ -300,31 +303,31 @@ class ScannedRecord:
 
     @property
     def content(self) -> bytes:
-        """Content of the record as bytes, without the fields for its kind and its length.
+        """Content of the record in bytes, without the opcode and the length field.
 
-        It is read from the file at first use, so that a scan of a large file is fast.
+        Read from the file on first access, so that scanning a large file is fast.
         """
         if self._content is None:
             self._content = self._scanner.content(self.frame)
         return self._content
 
     def head(self) -> "ChunkHead":
-        """Returns the head of a chunk, without unpacking its messages.
+        """Returns the header of a chunk, without decompressing its messages.
 
-        The head states the times of the messages, and how they are compressed.
+        The header states the times of the messages, and how they are compressed.
 
         Raises:
-            UnreadableRecord: The head is incomplete, or contains impossible values.
+            UnreadableRecord: The header is incomplete, or contains impossible values.
         """
         return self._scanner.head(self.frame)
 
     def unpack(self) -> bytes:
-        """Returns the decompressed records of a chunk, a compressed block of messages.
+        """Returns the uncompressed records of a chunk.
 
         The chunk is decompressed only in the first call.
 
         Raises:
-            UnreadableRecord: The chunk cannot be unpacked, or its checksum is wrong.
+            UnreadableRecord: The chunk cannot be decompressed, or its checksum is wrong.
         """
         if self._problem is not None:
             raise self._problem
@@ -338,23 +341,24 @@ class ScannedRecord:
 
 
 class RecordScanner:
-    """Finds the records of an MCAP file one after another, and skips damaged parts.
+    """Finds the records of an MCAP file one after another, skipping damaged parts.
 
-    Every program that reads a file, whether it checks, recovers or verifies it, reads the
-    records that this scanner yields.
+    Every program that checks, recovers or verifies a file reads the records through this
+    scanner.
 
     Args:
-        stream: The file, opened for reading. It begins at the current position of the stream.
+        stream: The file, opened for reading. The file begins at the current position of the
+            stream.
 
     Attributes:
         size: Size of the file, in bytes.
-        begins: True if the file begins with the mark of MCAP files.
+        begins: True if the file begins with the magic bytes of MCAP.
         ends: True if the file ends with a footer and the end mark.
         finished: True if the file was finished and has been read to its end.
-        trailing: Number of bytes after the end mark, if the mark has been read.
-        damaged: Damaged parts that were found so far, except a missing end.
-        torn: The incomplete part at the end of the file. None if the file is not cut off, or if
-            its end has not been reached yet.
+        trailing: Number of bytes after the end mark, once the mark has been read.
+        damaged: Damaged parts found so far, except a missing end.
+        torn: The incomplete part at the end of the file. None if the file is not truncated, or
+            if its end has not been reached yet.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -370,29 +374,29 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Reads some bytes of the file. Fewer bytes are returned at the end of the file.
+        """Reads bytes of the file at a given offset.
 
         Args:
             offset: Offset of the first byte in the file.
             length: Number of bytes to read.
 
         Returns:
-            The bytes. There are fewer than `length` if the file ends before.
+            The bytes, fewer than `length` if the end of the file comes first.
         """
         self._stream.seek(self._base + offset)
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every readable record of an MCAP file.
+        """Yields the kind and position of every readable record of an MCAP file.
 
-        Parts of the file that cannot be read are left out.
+        Unreadable parts of the file are skipped.
         """
         for item in self.scan():
             if isinstance(item, ScannedRecord):
                 yield item.frame
 
     def scan(self) -> Iterator[ScannedRecord | Damage]:
-        """Yields the records and the damaged parts of the file in the order of their offsets.
+        """Yields the records and the damaged parts of the file, sorted by offset.
 
         Bytes that cannot be a record are skipped, added to `damaged`, and yielded as a damaged
         part. If the end of the file is missing, `torn` is set. Every call starts at the
@@ -443,7 +447,7 @@ class RecordScanner:
     def _end_at(self, footer_end: int) -> None:
         """Checks that an MCAP file has its end mark after the footer, its last record.
 
-        The attributes about the end of the file are set.
+        Sets the attributes that describe the end of the file.
 
         Args:
             footer_end: Offset of the first byte after the footer.
@@ -455,7 +459,7 @@ class RecordScanner:
             self.torn = Damage(footer_end, rest, "its last mark is cut off")
 
     def _resume(self, search_start: int, offset: int, problem: str) -> int | None:
-        """Notes a damaged part, and finds the next readable chunk.
+        """Records a damaged part, and finds the next readable chunk.
 
         If no readable chunk follows, the rest of the file is damaged. The end of the file still
         counts as present if the file ends with a footer.
@@ -466,7 +470,7 @@ class RecordScanner:
             problem: Description of the problem.
 
         Returns:
-            The offset of the chunk. None if no readable chunk follows.
+            The offset of the chunk, or None if no readable chunk follows.
         """
         chunk_offset = self._find_chunk(search_start)
         if chunk_offset is not None:
@@ -482,10 +486,10 @@ class RecordScanner:
         return chunk_offset
 
     def _frame_at(self, offset: int) -> RecordFrame:
-        """Returns kind, position and length of the MCAP record that begins at an offset.
+        """Returns the kind, position and length of the MCAP record that begins at an offset.
 
         Raises:
-            UnreadableRecord: There is no record, or it reaches beyond the end of the file.
+            UnreadableRecord: There is no record, or it extends beyond the end of the file.
         """
         head = self.read(offset, RECORD_HEAD_BYTES)
         if len(head) < RECORD_HEAD_BYTES:
@@ -502,29 +506,27 @@ class RecordScanner:
         return RecordFrame(offset, opcode, length)
 
     def content(self, frame: RecordFrame) -> bytes:
-        """Reads the content of a record, without the fields for its kind and its length.
+        """Reads the content of a record, without the opcode and the length field.
 
         Args:
-            frame: Place of the record in the file.
+            frame: Position of the record in the file.
 
         Returns:
-            The content. It is shorter than `frame.length` if the file ends before.
+            The content, shorter than `frame.length` if the end of the file comes first.
         """
         return self.read(frame.offset + RECORD_HEAD_BYTES, frame.length)
 
     def head(self, frame: RecordFrame) -> ChunkHead:
-        """Reads the head of a chunk, a block of compressed messages in an MCAP file.
-
-        The compressed messages themselves are not read.
+        """Reads the header of a chunk, but not its compressed messages.
 
         Args:
-            frame: Place of the chunk in the file.
+            frame: Position of the chunk in the file.
 
         Returns:
-            The head, which states the times, the size, the compression and the checksum.
+            The header, which states the times, the size, the compression and the checksum.
 
         Raises:
-            UnreadableRecord: The head is incomplete, or contains impossible values.
+            UnreadableRecord: The header is incomplete, or contains impossible values.
         """
         content = self.read(
             frame.offset + RECORD_HEAD_BYTES, min(frame.length, _MAX_HEAD_BYTES)
@@ -534,11 +536,11 @@ class RecordScanner:
     def _find_chunk(self, offset: int) -> int | None:
         """Finds the first readable chunk at or after an offset.
 
-        A chunk is recognised by the name of its compression, which has a fixed offset in its
-        head. Therefore uncompressed chunks are not found.
+        A chunk is recognised by the name of its compression method, which has a fixed offset in
+        its header. Uncompressed chunks are therefore not found.
 
         Returns:
-            The offset of the chunk. None if there is no such chunk.
+            The offset of the chunk, or None if there is no such chunk.
         """
         lead_bytes = RECORD_HEAD_BYTES + _COMPRESSION_NAME_OFFSET
         for window_offset in range(offset, self.size, _SCAN_BYTES):
@@ -557,11 +559,11 @@ class RecordScanner:
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Computes the CRC-32 checksum of a part of the file, to detect changed bytes.
+        """Computes the CRC-32 checksum of a part of the file, to detect modified bytes.
 
         Args:
             begin: Offset of the first byte of the part.
-            end: Offset of the first byte after the part.
+            end: Offset after the last byte of the part.
         """
         crc = 0
         for offset in range(begin, end, _SCAN_BYTES):
@@ -572,19 +574,18 @@ class RecordScanner:
         """Reads the footer of the file, its last record, which states where the index is.
 
         Returns:
-            The footer. None if the file is not finished and therefore has no footer.
+            The footer, or None if the file is unfinished and therefore has no footer.
         """
         content = self.read(max(0, self.size - _FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
-        """Checks the summary at the end of an MCAP file, which has its index, by its checksum.
+        """Returns True if the summary at the end of the file matches its checksum.
+
+        The summary contains the index of the file.
 
         Args:
             footer: Footer of the file, which states the checksum.
-
-        Returns:
-            True if the summary has this checksum.
         """
         summary_start = footer.summary_start
         footer_start = self.size - _FOOTER_BYTES
@@ -600,13 +601,12 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """Returns True if an attachment of a log, such as its scenario, has its stored checksum.
+    """Returns True if an attachment of a log, such as its scenario, matches its checksum.
+
+    A checksum of 0 means that there is none, and also counts as a match.
 
     Args:
-        attachment: Content of the attachment's record.
-
-    Returns:
-        True if the checksum is right, or if it is 0, which means that there is none.
+        attachment: Content of the attachment record.
     """
     crc = int.from_bytes(attachment[-4:], "little")
     return not crc or zlib.crc32(memoryview(attachment)[:-4]) == crc
@@ -615,11 +615,11 @@ def has_right_crc(attachment: bytes) -> bool:
 def parse_record(opcode: int, content: bytes) -> Any:
     """Decodes the content of a record with the `mcap` package.
 
-    The package raises various errors for damaged content. They are converted to a single kind
-    of error here.
+    The various errors that the package raises for damaged content are converted to a single
+    error type.
 
     Args:
-        opcode: Number of the kind of record, which must be in `KINDS`.
+        opcode: Opcode of the record, which must be in `KINDS`.
         content: Content of the record.
 
     Returns:
@@ -648,7 +648,7 @@ class _Content(ReadDataStream):
 
 
 def _opcode_name(opcode: int) -> str:
-    """Returns the name of a kind of records, such as "chunk index", for error messages."""
+    """Returns the name of a kind of record, such as "chunk index", for error messages."""
     if opcode not in _OPCODES:
         return f"kind {opcode}"
     return Opcode(opcode).name.lower().replace("_", " ")
@@ -659,4 +659,4 @@ KINDS: dict[int, Any] = {
     kind: getattr(records, kind.name.title().replace("_", ""))
     for kind in _OPCODES - {OP_MESSAGE, Opcode.MESSAGE_INDEX, Opcode.CHUNK}
 }
-"""Class of the `mcap` package for each kind of record that `parse_record` decodes."""
+"""Maps each kind of record that `parse_record` decodes to its class in the `mcap` package."""

@@ -1,16 +1,16 @@
-"""Writes MCAP files, in which logs store their messages.
+"""Writes MCAP files, the format in which logs store their messages.
 
 Messages are collected into chunks, which are compressed and written to a stream. The index,
-which states where the chunks are, is written at the end of the file. The package `mcap` also
-contains a writer, but that writer keeps a dictionary for every chunk, which takes 46 MiB per
-hour at ten chunks per second with twelve channels, and needs three times the computing time.
-The tests use that package to read the files of this writer.
+which states where the chunks are, is written at the end of the file. The writer of the `mcap`
+package is not used because it keeps a dictionary for every chunk, which takes 46 MiB per hour
+at ten chunks per second with twelve channels, and because it needs three times the computing
+time. The tests use that package to read the files written here.
 
 Invariant:
     - The same calls produce the same bytes.
     - Memory grows only by the encoded index entries of the chunks.
-    - The length of the file's end is known at any time, so that disk space can be reserved for
-      it.
+    - The length of the end of the file is known at any time, so that disk space can be reserved
+      for it.
 """
 
 import struct
@@ -26,7 +26,7 @@ from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
 from .running_digest import DIGESTS, RunningDigest
 
 _CHUNK_BYTES = 1 << 20
-"""Size of the messages at which a chunk is closed, in bytes before compression."""
+"""Total size of messages at which a chunk is closed, in bytes before compression."""
 
 # Fields of fixed size, in the order of the specification at mcap.dev.
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -41,31 +41,30 @@ _SUMMARY = (
     Opcode.ATTACHMENT_INDEX,
     Opcode.METADATA_INDEX,
 )
-"""Kinds of the records in the summary at the end of a file, in the order of the file."""
+"""Kinds of records in the summary at the end of a file, in file order."""
 _COMPRESSION = "zstd"
 _FIXED_END_BYTES = 512
-"""Upper bound of the size of the records at the end whose number is fixed, in bytes.
+"""Upper bound on the total size of the records at the end whose number is fixed, in bytes.
 
-These are the statistics without the counts of channels, the offsets of six groups of records,
+These are the statistics without the counts per channel, the offsets of six groups of records,
 the end of the data, the footer and the end mark.
 """
 
 
 class Sink(Protocol):
-    """Destination of the bytes of the file: a file, or a buffer that waits for `flush`.
+    """Destination for the bytes of the file: a file, or a buffer that waits for `flush`.
 
     If the sink has a method `reserve(size)`, the writer calls it with the number of bytes that
-    the end of the file will need. Disk space for them can then be reserved.
+    the end of the file will need, so that the sink can reserve disk space for them.
     """
 
     def write(self, data: bytes, /) -> int:
-        """Accepts bytes for the file. Some implementations store them until `flush`.
+        """Accepts bytes for the file, and returns their number.
+
+        Some implementations buffer the bytes until `flush`.
 
         Args:
-            data: The bytes.
-
-        Returns:
-            The number of bytes.
+            data: The bytes to write.
         """
 
     def flush(self) -> None:
@@ -73,56 +72,55 @@ class Sink(Protocol):
 
 
 def _pack_text(text: str) -> bytes:
-    """Encodes a string as MCAP files require: its length in bytes, then its bytes in UTF-8."""
+    """Encodes a string for an MCAP file: its length in bytes, then its bytes in UTF-8."""
     # The name of a file may contain surrogates, which UTF-8 cannot encode.
     data = text.encode(errors="backslashreplace")
     return _pack_bytes(data)
 
 
 def _pack_text_map(texts: Mapping[str, str]) -> bytes:
-    """Encodes a dictionary of strings as MCAP files require.
+    """Encodes a dictionary of strings for an MCAP file.
 
-    The length of the encoded map in bytes comes first, then each key and each value.
+    The length of the encoded dictionary in bytes comes first, then each key and each value.
 
     Args:
-        texts: The map.
+        texts: The dictionary.
     """
     data = b"".join(_pack_text(key) + _pack_text(value) for key, value in texts.items())
     return _pack_bytes(data)
 
 
 def _pack_bytes(data: bytes) -> bytes:
-    """Returns bytes, preceded by their number in 32 bits."""
+    """Returns bytes preceded by their length as a 32-bit integer."""
     return struct.pack("<I", len(data)) + data
 
 
 def _pack_long_bytes(data: bytes) -> bytes:
-    """Returns bytes, preceded by their number in 64 bits."""
+    """Returns bytes preceded by their length as a 64-bit integer."""
     return struct.pack("<Q", len(data)) + data
 
 
 def _pack_record(opcode: int, body: bytes) -> bytes:
-    """Encodes a record of an MCAP file: its kind, the length of its content, and the content.
+    """Encodes an MCAP record: its opcode, the length of its content, and the content.
 
     Args:
-        opcode: Number of the kind of record.
+        opcode: Identifies the kind of record.
         body: Content of the record.
     """
     return RECORD_HEAD.pack(opcode, len(body)) + body
 
 
 class McapWriter:
-    """Writer of one MCAP file, from its first byte to its end mark.
+    """Writes one MCAP file, from its first byte to its end mark.
 
-    First the schemas and channels are registered, then messages are added. `finish` completes
-    the file.
+    Schemas and channels are registered first, then messages are added. `finish` completes the
+    file.
 
     Args:
-        stream: File or buffer that receives the bytes. It is flushed whenever a chunk is
-            complete.
-        library: Name of the program, which the file states.
-        profile: MCAP profile, which the file states.
-        chunk_bytes: Size of the messages at which a chunk is closed, in bytes.
+        stream: File or buffer to write to. It is flushed whenever a chunk is complete.
+        library: Name of the writing program, as stated in the file.
+        profile: MCAP profile, as stated in the file.
+        chunk_bytes: Total size of messages at which a chunk is closed, in bytes.
 
     Attributes:
         position: Number of bytes written.
@@ -132,7 +130,7 @@ class McapWriter:
     def __init__(
         self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = _CHUNK_BYTES
     ) -> None:
-        """Begins an MCAP file with the eight bytes that identify the format, and a header."""
+        """Begins an MCAP file with the eight magic bytes of the format, and a header."""
         self.position = 0
         self.messages = 0
         self._stream = stream
@@ -171,7 +169,7 @@ class McapWriter:
 
     @property
     def end_bytes(self) -> int:
-        """Upper limit of the bytes that the end of the file (index and end mark) may need.
+        """Upper bound on the size of the end of the file (index and end mark), in bytes.
 
         This much disk space must be reserved so that the file can be finished. The messages of
         the chunk that is still open are not included, see `open_chunk_bytes`.
@@ -181,9 +179,9 @@ class McapWriter:
 
     @property
     def open_chunk_bytes(self) -> int:
-        """Largest size of the messages that were added but not written yet, in bytes.
+        """Upper bound on the size of messages added but not yet written, in bytes.
 
-        These messages form a block that is written at once (the open chunk). The size includes
+        These messages form the open chunk, which is written as one block. The bound includes
         the index of the messages. It is 0 if there are no such messages.
         """
         if not self._open_chunk:
@@ -198,10 +196,10 @@ class McapWriter:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last message that was written to the file, in s.
+        """Time from the first to the last message written to the file, in s.
 
-        The log times are used, at which the messages arrived at the recorder. Messages of the
-        chunk that is still open have not been written yet. The duration is 0 if nothing was
+        Based on the log times, at which the messages arrived at the recorder. Messages of the
+        chunk that is still open do not count as written. The duration is 0 if nothing was
         written.
         """
         first_ns, last_ns = self._span_ns or (0, 0)
@@ -213,10 +211,10 @@ class McapWriter:
         Args:
             name: Name of the schema.
             encoding: Language of the schema, such as "jsonschema".
-            data: Text of the schema, encoded.
+            data: Encoded text of the schema.
 
         Returns:
-            The identifier of the schema in the file, which `register_channel` needs.
+            The identifier of the schema in the file, for use with `register_channel`.
         """
         number = self._summary_counts[Opcode.SCHEMA] + 1
         body = struct.pack("<H", number) + _pack_text(name) + _pack_text(encoding)
@@ -234,16 +232,16 @@ class McapWriter:
     ) -> int:
         """Writes the definition of a channel, a sequence of messages of one kind, to the file.
 
-        The messages that are still in memory (the open chunk) follow it in the file.
+        The definition precedes the messages that are still in memory (the open chunk).
 
         Args:
             topic: Topic of the channel.
             message_encoding: Encoding of the messages.
-            schema_id: Number of the schema. 0 is a channel without a schema.
+            schema_id: Identifier of the schema, or 0 for a channel without a schema.
             metadata: Metadata of the channel.
 
         Returns:
-            The number of the channel.
+            The identifier of the channel in the file, for use with `add_message`.
         """
         number = len(self._counts) + 1
         body = struct.pack("<HH", number, schema_id)
@@ -260,10 +258,10 @@ class McapWriter:
     ) -> None:
         """Adds a message to the open chunk, and writes the chunk if it is large enough.
 
-        Messages of a chunk are compressed together, which makes the file much smaller.
+        The messages of a chunk are compressed together, which makes the file much smaller.
 
         Args:
-            channel_id: Number of the channel, from `register_channel`.
+            channel_id: Identifier of the channel, from `register_channel`.
             log_time: Time at which the message arrived, in ns.
             data: Bytes of the message.
             publish_time: Time at which the message was sent, in ns.
@@ -281,13 +279,13 @@ class McapWriter:
             self.flush()
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Writes a named dictionary of strings into the file, such as facts about a session.
+        """Writes a named dictionary of strings to the file, such as facts about a session.
 
-        It precedes the messages of the open chunk (block that is not written yet) in the file.
+        The dictionary precedes the messages that are still in memory (the open chunk).
 
         Args:
             name: Name of the metadata.
-            data: The map.
+            data: The dictionary.
         """
         content = _pack_text(name) + _pack_text_map(data)
         if name != DIGESTS:
@@ -302,11 +300,11 @@ class McapWriter:
     ) -> None:
         """Writes an attachment, a small file that is stored with the messages.
 
-        The messages that are still in memory (the open chunk) follow it in the file.
+        The attachment precedes the messages that are still in memory (the open chunk).
 
         Args:
-            create_time: Time at which the attachment was created, in ns. 0 if it is unknown.
-            log_time: Time at which it was recorded, in ns. 0 if it is unknown.
+            create_time: Time at which the attachment was created, in ns; 0 if unknown.
+            log_time: Time at which the attachment was recorded, in ns; 0 if unknown.
             name: Name of the attachment.
             media_type: Media type of the attachment.
             data: Content of the attachment.
@@ -325,7 +323,7 @@ class McapWriter:
     def flush(self) -> None:
         """Ends the open chunk, if it contains messages, and flushes the stream.
 
-        All messages so far can then be read from the file, even if the program ends now.
+        All messages so far can then be read from the file, even if the program stops now.
         Frequent calls produce small chunks, which compress less well.
         """
         if self._open_chunk:
@@ -337,11 +335,11 @@ class McapWriter:
     def close_digest(self) -> dict[str, str]:
         """Closes the open chunk, and writes the digests of all contents as metadata.
 
-        The digests are checksums that reveal later changes of the file. Only `finish` may be
-        called afterwards.
+        The digests are checksums that reveal later modifications of the file. Afterwards, only
+        `finish` may be called.
 
         Returns:
-            The metadata with the digests.
+            The metadata that contain the digests.
         """
         if self._open_chunk:
             self._close_chunk()
@@ -350,14 +348,14 @@ class McapWriter:
         return facts
 
     def _close_chunk(self) -> None:
-        """Writes the open chunk, the block of the newest messages, and the indexes to it.
+        """Writes the open chunk, which contains the newest messages, and the indexes to it.
 
-        The format is defined by the specification of MCAP. Three kinds of records are written:
+        The format is defined by the MCAP specification. Three kinds of records are produced:
 
-        1. Chunk: a head with the time range, the size and the checksum (CRC) of the messages,
+        1. Chunk: a header with the time range, the size and the checksum (CRC) of the messages,
            and the compressed messages.
-        2. Message index, one for each channel with messages in the chunk: the log time of each
-           message, and its offset in the unpacked chunk.
+        2. Message index, one per channel with messages in the chunk: the log time of each
+           message, and its offset in the uncompressed chunk.
         3. Chunk index: the offsets of the chunk and its message indexes. It is only added to
            the summary, which `finish` writes at the end of the file.
 
@@ -434,7 +432,7 @@ class McapWriter:
     def _pack_statistics(self) -> bytes:
         """Encodes the MCAP record with the statistics of the file.
 
-        It contains the numbers of all kinds of records, and the first and last arrival time.
+        It contains the number of records of each kind, and the first and last arrival times.
         """
         first_ns, last_ns = self._span_ns or (0, 0)
         head = _STATISTICS.pack(

@@ -1,14 +1,13 @@
 """Reads the files of a session's log, and merges them into one log.
 
-A log contains the messages of a session, a joint run of several arms. It has several files, the
-parts, if the recorder split it, or if several recorders recorded the session one after another
-or at the same time.
+A log has several files (parts) if the recorder split it, or if several recorders recorded the
+session, one after another or simultaneously.
 
 Invariant:
-    - A message that several parts contain is written once.
-    - Parts of different sessions are refused. Parts that contain different messages with the
-      same number are also refused.
-    - The order in which the user names the parts does not matter.
+    - A message that occurs in several parts is written once.
+    - Parts of different sessions are rejected, and so are parts that contain different messages
+      with the same number.
+    - The order in which the user lists the parts does not matter.
 """
 
 import hashlib
@@ -36,8 +35,8 @@ def read_session(
 
     Args:
         sources: Paths, or binary files opened for reading, in any order.
-        progress: Function that is called repeatedly with the number of bytes read and their
-            total over all files.
+        progress: Function that is called repeatedly with the number of bytes read and the total
+            over all files.
 
     Returns:
         The contents of all files, as if they were one file.
@@ -53,9 +52,9 @@ def read_sessions(files: Sequence[Path], progress: Progress | None) -> list[LogC
     """Reads the logs of one or several sessions.
 
     Args:
-        files: The files, in any order.
-        progress: Function that is called repeatedly with the number of bytes read and their
-            total over all files.
+        files: Paths of the files, in any order.
+        progress: Function that is called repeatedly with the number of bytes read and the total
+            over all files.
 
     Returns:
         The contents of each session. Files of the same session are merged.
@@ -73,10 +72,10 @@ def read_sessions(files: Sequence[Path], progress: Progress | None) -> list[LogC
 def _read_parts(
     sources: Sequence[str | Path | BinaryIO], progress: Progress | None
 ) -> list[LogContents]:
-    """Reads the contents of files, and reports the progress over all files together.
+    """Reads the contents of files, and reports the overall progress.
 
-    All files are opened before the first one is read, so that a missing file is reported at
-    once.
+    All files are opened before the first one is read, so that a missing file is reported
+    immediately.
     """
     parts: list[LogContents] = []
     with ExitStack() as stack:
@@ -92,11 +91,11 @@ def _read_parts(
 
 
 def _open_source(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[BinaryIO, str]:
-    """Opens one file of a log. A file that the caller has opened already is used as it is.
+    """Opens one file of a log. A file that the caller has already opened is used as it is.
 
     Args:
         source: Path, or binary file opened for reading.
-        stack: Context that closes the files that are opened here.
+        stack: Context that closes the files opened here.
 
     Returns:
         The open file, and its name for error messages.
@@ -114,7 +113,7 @@ def _open_source(source: str | Path | BinaryIO, stack: ExitStack) -> tuple[Binar
 
 @contextmanager
 def _convert_errors(name: str) -> Iterator[None]:
-    """Converts an error of the operating system to a `LogError` that names the file."""
+    """Converts an operating system error to a `LogError` that names the file."""
     try:
         yield
     except OSError as error:
@@ -124,7 +123,7 @@ def _convert_errors(name: str) -> Iterator[None]:
 
 
 def _measure_size(stream: BinaryIO) -> int:
-    """Returns the number of bytes from the present position to the end of a stream."""
+    """Returns the number of bytes from the current position to the end of a stream."""
     position = stream.tell()
     end = stream.seek(0, os.SEEK_END)
     stream.seek(position)
@@ -132,11 +131,11 @@ def _measure_size(stream: BinaryIO) -> int:
 
 
 def _merge_parts(parts: Sequence[LogContents]) -> LogContents:
-    """Joins the contents of several files into which the log of a session was divided.
+    """Merges the contents of the files into which the log of a session was divided.
 
-    The recorder states at the end of each file how many messages it received. The counts of a
-    channel do not apply to the joined log and are left out. The other counts, such as dropped
-    messages, are added.
+    The recorder states at the end of each file how many messages it received. The counts of
+    individual channels do not apply to the merged log and are left out. All other counts, such
+    as that of dropped messages, are added up.
 
     Args:
         parts: One or more parts, in any order.
@@ -179,10 +178,10 @@ def _merge_parts(parts: Sequence[LogContents]) -> LogContents:
 
 
 def _check_same_session(first: LogContents, other: LogContents) -> None:
-    """Checks that two files belong to the log of the same session, before they are joined.
+    """Raises LogError if two files belong to the logs of different sessions.
 
     Raises:
-        LogError: The files belong to different sessions. The text lists the differences.
+        LogError: The files belong to different sessions. The message lists the differences.
     """
     expected = _identify_session(first)
     actual = _identify_session(other)
@@ -197,7 +196,7 @@ def _check_same_session(first: LogContents, other: LogContents) -> None:
 
 
 def _check_digests(parts: Sequence[LogContents]) -> None:
-    """Checks that every part of a log is the continuation of the part before it.
+    """Raises LogError unless every part of a log continues the part before it.
 
     At the end of a part, the recorder writes a digest (checksum) of its messages. The next part
     repeats this digest at its beginning.
@@ -225,16 +224,16 @@ def _first_time(part: LogContents) -> tuple[int, str]:
 
 
 def _part_index(part: LogContents) -> int:
-    """Returns the index of a part, from 1. It is 0 if the part states no valid index."""
+    """Returns the index of a part, counted from 1, or 0 if the part states no valid index."""
     text = part.metadata.get(PART, {}).get("index", "1")
     return int(text) if text.isdecimal() and len(text) < 10 else 0
 
 
 def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
-    """Adds the recorders' counts that belong to no channel, such as dropped messages.
+    """Adds up the recorders' counts that belong to no channel, such as dropped messages.
 
-    A recorder continues its counts from part to part. Therefore the last part of a recorder
-    contains the totals. The totals of different recorders are added.
+    A recorder continues its counts from part to part, so the last part of a recorder contains
+    its totals. The totals of different recorders are added.
 
     Args:
         parts: The parts, in the order of their first messages.
@@ -256,7 +255,7 @@ def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
 def _recorder_boot(part: LogContents) -> int:
     """Returns the random number that identifies the process that recorded a file.
 
-    The number is 0 if the file has no readable message of the recorder.
+    0 if the file has no readable message of the recorder.
     """
     kinds: dict[str, Any] = {topics.STATS: RecorderStats, topics.EVENT: Event}
     for channel, kind in kinds.items():
@@ -274,7 +273,7 @@ def _recorder_boot(part: LogContents) -> int:
 
 
 def _identify_session(part: LogContents) -> dict[str, str]:
-    """Collects the facts that identify a session, on which all parts of its log agree.
+    """Collects the facts that identify a session and are the same in all parts of its log.
 
     Files can be read as one log only if these facts are equal.
 
@@ -282,7 +281,7 @@ def _identify_session(part: LogContents) -> dict[str, str]:
         part: Contents of one part.
 
     Returns:
-        The metadata of the session, without those that differ between parts.
+        The metadata of the session, excluding fields that differ between parts.
     """
     names = ("session", "driver", "epoch_unix_ns")
     facts = {name: part.session.get(name, "unknown") for name in names}
@@ -291,10 +290,10 @@ def _identify_session(part: LogContents) -> dict[str, str]:
 
 
 def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
-    """Joins the messages of a topic from several files of the same log, in file order.
+    """Merges the messages of a topic from several files of the same log, in file order.
 
     Messages are recognised by a key, such as the tick of a record. A message that an earlier
-    file contains already is left out.
+    file already contains is left out.
 
     Args:
         topic: The topic. At least one part contains it.
@@ -337,14 +336,14 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
 
 
 def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[Hashable]:
-    """Returns a key for each message of a topic, by which copies of a message are recognised.
+    """Returns a key for each message of a topic, used to recognise copies of a message.
 
     Several recorders may have recorded the same message. Its copies have the same key, and
     different messages have different keys.
 
     Args:
         topic: The topic.
-        payloads: Messages of the topic, encoded.
+        payloads: Encoded messages of the topic.
         source: Name of the file for error messages.
 
     Raises:
@@ -372,10 +371,10 @@ def _list_keys(topic: str, payloads: Sequence[bytes], source: str) -> Sequence[H
 
 
 def _describe_message(topic: str, key: Hashable) -> str:
-    """Returns a noun phrase for a message, for a sentence about differing files.
+    """Returns a noun phrase for a message, for use in a sentence about differing files.
 
-    For example, the key 12 on the topic of the records (results of control periods) of "m1" is
-    "the record of tick 12 of m1". For the keys see `_list_keys`.
+    For example, the key 12 in the topic of the records of "m1" becomes "the record of tick 12
+    of m1". For the keys see `_list_keys`.
     """
     member, kind = topic.split("/")[-2:]
     match key:

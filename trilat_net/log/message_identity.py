@@ -1,11 +1,11 @@
 """Identifies a message by its content: sender, channel, number and sending time.
 
-A damaged disk may return an old block, so that a message of another run lies in the middle of a
-log. The checks and the recovery of logs find such messages by comparing the identity of a
-message with its place in the file.
+A damaged disk may return an old block, which leaves a message of another run in the middle of a
+log. The checks and the recovery of logs detect such messages by comparing the identity of a
+message with its position in the file.
 
 Invariant:
-    - The identity depends only on the content of the message, and never on its place in the
+    - The identity depends only on the content of the message, never on its position in the
       file, so that the two can be compared.
 """
 
@@ -29,17 +29,17 @@ AnyMessage = State | LinkStats | Event | RecorderStats
 class MessageIdentity(NamedTuple):
     """Sender, channel, number and sending time of a network message.
 
-    Lost and repeated messages are recognised by this identity.
+    Used to recognise lost and repeated messages.
 
     Attributes:
-        sender: Name of the member of the session, a site (arm controller) or the recorder, that
-            published the message.
+        sender: Name of the member of the session (a site or the recorder) that published the
+            message.
         channel: Name of the channel: "state" (records), "link" (statistics), "event" or
             "stats".
-        number: Number of the message in its channel. It is -1 if the message states no number.
-        sequence: Sequence number of the message in a log. It is -1 if the message states no
+        number: Number of the message in its channel, or -1 if the message states no number.
+        sequence: Sequence number of the message in a log, or -1 if the message states no
             number.
-        sent_ns: Sending time, in ns after the start of the session. None if the message states
+        sent_ns: Sending time since the start of the session, in ns. None if the message states
             no time.
     """
 
@@ -51,15 +51,12 @@ class MessageIdentity(NamedTuple):
 
     @classmethod
     def of_message(cls, message: AnyMessage, rate_hz: int) -> "MessageIdentity":
-        """Determines the sender, the channel and the number of a message from its content.
+        """Determines the sender, channel, number and time of a message from its content.
 
         Args:
             message: The decoded message.
-            rate_hz: Tick rate of the sender, in Hz. It is needed to number statistics, which
-                are not sent in every tick. It has no effect on other messages.
-
-        Returns:
-            The identity of the message.
+            rate_hz: Tick rate of the sender, in Hz. Only needed to number statistics, which are
+                not sent in every tick.
         """
         match message:
             case State():
@@ -104,18 +101,18 @@ class MessageIdentity(NamedTuple):
 
 
 def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
-    """Computes the boot of a site (arm controller) in a run in virtual time.
+    """Computes the boot of a site in a run in virtual time.
 
-    The boot identifies one start of a site. It is a random number in live sessions. In virtual
-    time, it is derived from the scenario, so that runs are reproducible and every message of a
+    The boot identifies one start of a site. In live sessions it is a random number. In virtual
+    time it is derived from the scenario, so that runs are reproducible and every message of a
     run identifies its scenario.
 
     Args:
-        scenario_sha256: SHA-256 of the scenario, in hexadecimal digits.
+        scenario_sha256: SHA-256 hash of the scenario, in hexadecimal digits.
         site: Name of the site.
 
     Returns:
-        A number of 64 bits.
+        A 64-bit integer.
     """
     digest = hashlib.sha256(f"{scenario_sha256}/{site}".encode()).digest()
     return int.from_bytes(digest[:8], "big")

@@ -1,21 +1,22 @@
 """Converts orientations to time series without jumps: unit quaternions, or six numbers.
 
-A log contains an orientation as a rotation vector: the axis of a rotation times its angle,
-which is at most half a turn. When the angle passes half a turn, as it does for a tool that
-points down, the vector jumps by a whole turn, although the orientation changes smoothly. Adding
-whole turns to the vector cannot avoid these jumps for every motion. Time series that leave the
-program therefore have one of these formats:
+A log stores an orientation as a rotation vector, the axis of a rotation times its angle, which
+is at most half a turn. When the angle passes half a turn, as it does for a tool that points
+down, the vector jumps by a whole turn, although the orientation changes smoothly. Adding whole
+turns to the vector does not avoid these jumps for every motion. Time series that leave the
+program therefore use one of these formats:
 
-- Unit quaternions w, x, y, z. A quaternion and its negative are the same orientation. The sign
-  is chosen so that each quaternion is nearest to the previous one, and the first has w >= 0. A
-  turn by a small angle moves the quaternion by half of that angle.
-- Six numbers: the first and the second column of the rotation matrix. They depend only on the
-  present orientation and not on the past, as observations and actions of a learned policy must
-  (Y. Zhou et al., "On the continuity of rotation representations in neural networks", CVPR
-  2019). A turn by a small angle moves them by at most sqrt(2) times that angle.
+- Unit quaternions w, x, y, z. A quaternion and its negative represent the same orientation. The
+  signs are chosen such that the first quaternion has w >= 0 and each quaternion is as close as
+  possible to the previous one. A rotation by a small angle moves the quaternion by half of that
+  angle.
+- Six numbers: the first and second columns of the rotation matrix. They depend only on the
+  current orientation and not on the past, as required for observations and actions of a learned
+  policy (Y. Zhou et al., "On the continuity of rotation representations in neural networks",
+  CVPR 2019). A rotation by a small angle moves them by at most sqrt(2) times that angle.
 
 Invariant:
-    - The rotation is that of the log, except for rounding. Only its representation differs.
+    - The rotation is that of the log, up to rounding. Only its representation differs.
     - Rotation vectors of any length are accepted.
 """
 
@@ -26,19 +27,19 @@ import numpy as np
 from ..core import POSE, POSITION, Array
 
 QUATERNION_AXES = ("qw", "qx", "qy", "qz")
-"""Names of the four numbers of a quaternion, in tables."""
+"""Names of the four components of a quaternion in tables."""
 MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
 """Names of the six numbers of an orientation, with row and column of the rotation matrix."""
 
 
 def align_signs(quaternions: Array) -> Array:
-    """Chooses the signs of unit quaternions so that a time series of them does not jump.
+    """Chooses the signs of a time series of unit quaternions so that it does not jump.
 
-    A quaternion and its negative are the same orientation. Each quaternion gets the sign with
-    which it is nearest to the previous one. The sign of the first quaternion is kept.
+    A quaternion and its negative represent the same orientation. Each quaternion is given the
+    sign that brings it closest to the previous one. The sign of the first quaternion is kept.
 
     Args:
-        quaternions: The quaternions in the order of time, shape (K, 4).
+        quaternions: The quaternions in chronological order, shape (K, 4).
 
     Returns:
         The quaternions or their negatives, shape (K, 4).
@@ -53,14 +54,14 @@ def align_signs(quaternions: Array) -> Array:
 
 
 class RotationVectors:
-    """Orientations as rotation vectors, with their conversions to other formats.
+    """Orientations as rotation vectors, with conversions to other representations.
 
-    A rotation vector is the axis of a rotation times its angle. Whole turns do not change the
-    rotation.
+    A rotation vector is the axis of a rotation times its angle. Adding whole turns does not
+    change the rotation.
 
     Args:
-        turns: K rotation vectors, shape (K, 3), in rad. Other shapes (..., 3) are possible for
-            `as_matrix_columns`.
+        turns: K rotation vectors, shape (K, 3), in rad. For `as_matrix_columns`, any shape
+            (..., 3) is allowed.
     """
 
     def __init__(self, turns: Array) -> None:
@@ -85,9 +86,9 @@ class RotationVectors:
     def as_quaternions(self) -> Array:
         """Computes the unit quaternions of the rotations as a time series without jumps.
 
-        A quaternion and its negative are the same rotation. The sign is chosen such that
-        neighbouring quaternions are close to each other, as curves and interpolation require.
-        The rotation vectors must be in the order of time.
+        A quaternion and its negative represent the same rotation. Signs are chosen such that
+        consecutive quaternions are close to each other, as needed for plotting and
+        interpolation. The rotation vectors must be in chronological order.
 
         Returns:
             The quaternions w, x, y, z, shape (K, 4).
@@ -98,14 +99,13 @@ class RotationVectors:
     def as_matrix_columns(self) -> Array:
         """Computes the first two columns of the rotation matrices.
 
-        With the unit quaternion (w, x, y, z) of the rotation, they are
+        For a rotation with the unit quaternion (w, x, y, z), they are
 
             (1 - 2 y y - 2 z z,  2 x y + 2 w z,  2 x z - 2 w y)
             (2 x y - 2 w z,  1 - 2 x x - 2 z z,  2 y z + 2 w x)
 
         Returns:
-            The entries `MATRIX_ENTRIES`, shape (..., 6) for rotation vectors of the shape
-            (..., 3).
+            The entries `MATRIX_ENTRIES`, shape (..., 6) for rotation vectors of shape (..., 3).
         """
         rows = RotationVectors(np.reshape(self._turns, (-1, 3)))
         w, v = rows.as_quaternion_parts()
@@ -125,12 +125,12 @@ class RotationVectors:
         return columns.reshape(*shape, len(MATRIX_ENTRIES))
 
     def nearest_to(self, references: Array) -> Array:
-        """Adds whole turns to the rotation vectors so that each is nearest to its reference.
+        """Adds whole turns to each rotation vector to bring it closest to a reference.
 
         The results may be longer than half a turn.
 
         Args:
-            references: A reference for each rotation vector, shape (K, 3), in rad.
+            references: One reference per rotation vector, shape (K, 3), in rad.
 
         Returns:
             Rotation vectors of the same rotations, shape (K, 3), in rad.
@@ -148,8 +148,8 @@ class RotationVectors:
     def without_jumps(self) -> Array:
         """Computes rotation vectors of the same rotations that do not jump at half a turn.
 
-        They may be up to a whole turn long, and jump at a whole turn instead. The rotation
-        vectors must be in the order of time.
+        They may be up to a whole turn long, and jump there instead. The rotation vectors must
+        be in chronological order.
 
         Returns:
             Rotation vectors of the same rotations, shape (K, 3), in rad.
@@ -165,16 +165,16 @@ class RotationVectors:
         return np.asarray(angle_by_sine * v)
 
     def turns_from(self, references: Array) -> Array:
-        """Computes the rotation vectors from reference orientations to the orientations.
+        """Computes the rotation vectors from reference orientations to these orientations.
 
-        The orientation is the quaternion (a, u), with the scalar part a and the vector part u,
-        and the reference is (b, v). The product of (a, u) and the conjugate (b, -v) is the
-        rotation between them, the quaternion (w, p):
+        Let the orientation be the quaternion (a, u), with scalar part a and vector part u, and
+        the reference (b, v). The rotation between them is the product of (a, u) and the
+        conjugate (b, -v), the quaternion (w, p):
 
             w = a b + u . v
             p = b u - a v - u x v
 
-        It is a rotation by the angle 2 atan2(|p|, w) about the axis p.
+        This is a rotation by the angle 2 atan2(|p|, w) about the axis p.
 
         Args:
             references: Reference orientations as rotation vectors, shape (K, 3), in rad.
@@ -199,10 +199,10 @@ class RotationVectors:
 
 
 def expand_poses(x: Array) -> Array:
-    """Replaces the rotation vectors of poses by six numbers.
+    """Replaces the rotation vector of each pose by two columns of its rotation matrix.
 
-    An environment for training observes poses in this format, and a user's operator class
-    receives the same numbers from `HandView`:
+    Training environments observe poses in this format, and `HandView` passes the same numbers
+    to a user's operator class:
 
     >>> import numpy as np
     >>> quarter_turn = np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])
@@ -225,14 +225,14 @@ def expand_poses(x: Array) -> Array:
 
 
 class QuaternionSigns:
-    """Chooses the signs of unit quaternions that arrive one after another, to avoid jumps.
+    """Chooses the signs of unit quaternions that arrive one by one, to avoid jumps.
 
-    A quaternion and its negative are the same orientation. Each quaternion gets the sign with
-    which it is nearest to the previous one, and the first one gets the sign with w >= 0.
+    A quaternion and its negative represent the same orientation. Each quaternion is given the
+    sign that brings it closest to the previous one. The first one is given the sign for which w
+    >= 0.
 
     Args:
-        w: Index of the scalar part w among the four numbers of a quaternion. It is the last one
-            in ROS 2.
+        w: Index of the scalar part w in a quaternion. In ROS 2, the scalar part is last.
     """
 
     def __init__(self, w: int = 3) -> None:
@@ -242,14 +242,15 @@ class QuaternionSigns:
     def align(self, quaternion: Sequence[float]) -> tuple[float, ...]:
         """Chooses the sign of the next quaternion in a time series, to avoid a jump.
 
-        The sign is the one with which the quaternion is nearest to the quaternion of the
-        previous call. In the first call, it is the sign with w >= 0.
+        The sign is the one that brings the quaternion closest to that of the previous call. In
+        the first call, it is the sign for which w >= 0.
 
         Args:
-            quaternion: The four numbers of the next unit quaternion in the order of time.
+            quaternion: The four components of the next unit quaternion, passed in chronological
+                order.
 
         Returns:
-            The quaternion or its negative, which is the same orientation.
+            The quaternion or its negative, which represents the same orientation.
         """
         # Two unit quaternions are nearest to each other if their scalar product is positive.
         dot = quaternion[self._w]

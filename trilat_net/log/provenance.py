@@ -1,6 +1,6 @@
 """Collects the versions of the program and its packages, which are stored in every log.
 
-With these versions, a run can be repeated later with the same program (law L5 of
+They make it possible to repeat a run later with the same program (law L5 of
 docs/develop/design.md).
 
 Invariant:
@@ -18,17 +18,17 @@ from ..core import compute_fingerprint
 from ..files import find_version
 
 _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
-"""Packages whose versions the provenance states."""
+"""Packages whose versions are part of the provenance."""
 
 
 def _run_git(*arguments: str) -> str | None:
-    """Runs git in the source tree of this program, to find out which version it is.
+    """Runs git in the source tree of this program, to determine its version.
 
     Args:
-        *arguments: Arguments of git, such as "rev-parse", "HEAD".
+        *arguments: Arguments for git, such as "rev-parse", "HEAD".
 
     Returns:
-        The output. None if the source tree is not a git checkout, or if git fails.
+        The output, or None if the source tree is not a git checkout or git fails.
     """
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
@@ -48,8 +48,8 @@ def collect_provenance() -> dict[str, str]:
     """Collects the facts about this program that explain how a log was produced.
 
     Returns:
-        Versions of the program and its packages, commit and platform, as metadata of a log.
-        There are no paths, times or host names, so that equal runs have equal logs.
+        Versions of the program and its packages, commit and platform, as metadata for a log.
+        Paths, times and host names are excluded so that equal runs have equal logs.
     """
     commit = _run_git("rev-parse", "HEAD")
     changed = _run_git("status", "--porcelain", "--untracked-files=no")

@@ -1,14 +1,13 @@
-"""Decodes single fields of many records into arrays, without decoding whole records.
+"""Decodes single fields of many records into arrays, without decoding complete records.
 
-This is much faster if only some fields are needed. A record is the encoded state of an arm in
-one period of its control loop. For example, `RecordColumns.ticks` returns the number of the
-period of each record. Every method raises `WireError` for the first message that is not a valid
-record.
+This is much faster if only a few fields are needed. For example, `RecordColumns.ticks` returns
+the tick of each record. Every method raises `WireError` at the first message that is not a
+valid record.
 
 Invariant:
     - Only the requested fields are decoded.
-    - Each field is checked as in a whole record: its type, its length, and that its numbers are
-      finite.
+    - Each field is checked in the same way as in a complete record: its type, its length, and
+      that its values are finite.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -35,30 +34,26 @@ _TYPES: dict[str, Any] = {
     "mode": _MODE,
     "rx": list[Stamp],
 }
-"""Types of fields for which `State` declares a wider type. They restrict the values."""
+"""More restrictive types for fields whose type in `State` is too wide."""
 _DEFAULTS = {"sent_ns": 0}
-"""Values of fields that records of older versions do not contain."""
+"""Values of fields that are missing from records of older versions."""
 
 
 class RecordColumns:
-    """Fields of encoded records, each of which is decoded into an array when it is requested.
+    """Fields of encoded records, each decoded into an array when it is requested.
 
-    Records of every version of the format that can be read are accepted. `IndexedRecords` has
-    the same arrays for records whose exact layout is known.
+    Accepts records of every readable version of the format. For records with an exactly known
+    layout, `IndexedRecords` provides the same arrays.
 
     Args:
-        payloads: K encoded records (results of control periods) of one site (arm controller).
+        payloads: K encoded records of one site.
     """
 
     def __init__(self, payloads: Sequence[bytes]) -> None:
         self._payloads = payloads
 
     def ticks(self) -> Ints:
-        """Decodes from every record the number of its control period (tick).
-
-        Returns:
-            The ticks, shape (K,).
-        """
+        """Decodes the tick of every record, shape (K,)."""
         if any(len(payload) > MAX_BYTES for payload in self._payloads):
             raise self._find_error()
         pairs = chain.from_iterable(self._decode_fields("v", "tick"))
@@ -70,7 +65,7 @@ class RecordColumns:
         return rows[:, 1].copy()
 
     def ints(self, field: str) -> Ints:
-        """Decodes an integer field of every record, and skips all other fields.
+        """Decodes an integer field of every record, skipping all other fields.
 
         Args:
             field: Name of an integer field of `State`.
@@ -81,15 +76,15 @@ class RecordColumns:
         return self._to_array(self._decode_fields(field), np.int64, len(self._payloads))
 
     def vectors(self, layout: Layout, *fields: str) -> dict[str, Array]:
-        """Decodes some vectors, such as joint angles, of every record, and skips other fields.
+        """Decodes vectors of every record, such as joint angles, skipping all other fields.
 
         Args:
             layout: Lengths of the vectors in these records.
             fields: Names of the fields, such as "q".
 
         Returns:
-            For each field an array of shape (K, length of the vector). The shape is (K, 0) for
-            a field that these records do not have.
+            Maps each field to an array of shape (K, length of the vector). The shape is (K, 0)
+            for a field that these records do not have.
         """
         record_count = len(self._payloads)
         lengths = layout.lengths()
@@ -131,18 +126,17 @@ class RecordColumns:
         return self._to_array(self._decode_fields(field), np.object_, len(self._payloads))
 
     def per_peer(self, field: str, peers: Sequence[str], absent: int) -> dict[str, Ints]:
-        """Decodes a field that contains an integer for each peer, such as `used`.
+        """Decodes a field that contains one integer per peer, such as `used`.
 
-        A peer is another site (arm controller) whose samples (sent states) the site receives.
-        The field of a record is a map from names of peers to integers.
+        In a record, such a field maps the names of peers to integers.
 
         Args:
             field: Name of the field.
             peers: Names of the peers.
-            absent: Number to return for a peer that the map of a record does not contain.
+            absent: Value to return for a peer that the field of a record does not contain.
 
         Returns:
-            For each peer the integers of all records, shape (K,).
+            Maps each peer to the integers of all records, shape (K,).
         """
         # A struct with an attribute per peer is decoded faster than a dict. The name of a peer
         # need not be a valid identifier, so the attributes have other names.
@@ -167,17 +161,17 @@ class RecordColumns:
         return {peer: rows[:, n].copy() for n, peer in enumerate(peers)}
 
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Decodes which states of other arms arrived in each control period.
+        """Decodes which samples of other arms arrived in each tick.
 
         Returns:
-            The number of arrivals of each record, shape (K,), and all N arrivals in order,
-            shape (N, 3). The columns are those of the field `rx` of a record: index of the
-            peer, tick (control period) of the sample, and delay in us.
+            The number of arrivals in each record, shape (K,), and all N arrivals in order,
+            shape (N, 3). The columns are those of the field `rx`: index of the peer, tick of
+            the sample, and delay in us.
         """
         counts = np.zeros(len(self._payloads), dtype=np.int64)
 
         def iterate_numbers() -> Iterator[int]:
-            """Yields the three numbers of every arrival, and stores the arrivals per record."""
+            """Yields three integers per arrival, and stores the arrivals of each record."""
             for row, arrivals in enumerate(self._decode_fields("rx")):
                 counts[row] = len(arrivals)
                 for entry in arrivals:
@@ -187,11 +181,11 @@ class RecordColumns:
         return counts, numbers.reshape(-1, 3)
 
     def _decode_fields(self, *fields: str, layout: Layout | None = None) -> Iterator[Any]:
-        """Yields the value of a field for every record, or a tuple for several fields.
+        """Yields the value of a field, or a tuple of several fields, for every record.
 
         Args:
             fields: Names of the fields.
-            layout: Lengths of the vectors. None accepts all lengths.
+            layout: Lengths of the vectors. If None, all lengths are accepted.
         """
         get_values: Callable[[Any], Any] = attrgetter(*fields)
         decoder = _find_decoder(fields, layout)
@@ -201,16 +195,16 @@ class RecordColumns:
     def _to_array(
         self, values: Iterable[Any], kind: Any, count: int, layout: Layout | None = None
     ) -> NDArray[Any]:
-        """Decodes values while they are put into an array, and reports an invalid record.
+        """Collects lazily decoded values in an array, and reports an invalid record.
 
         Args:
-            values: The values. They are decoded while they are iterated.
+            values: Iterator that decodes the values.
             kind: Data type of the array.
-            count: Number of values. It is -1 if the number is unknown.
-            layout: Lengths of the vectors, with which the error is found.
+            count: Number of values, or -1 if unknown.
+            layout: Lengths of the vectors, used to find the error.
 
         Raises:
-            WireError: A record is not valid.
+            WireError: A record is invalid.
         """
         try:
             return np.fromiter(values, kind, count)
@@ -220,17 +214,17 @@ class RecordColumns:
     def _find_error(
         self, default: str = "a number is out of range", layout: Layout | None = None
     ) -> WireError:
-        """Finds the first payload that is not a valid record, to name the reason in an error.
+        """Finds the first payload that is not a valid record, and returns its error.
 
-        The fast decoding of single fields does not show which record was wrong. Therefore the
-        records are decoded again as a whole.
+        The fast decoding of single fields does not show which record was invalid, so the
+        records are decoded again completely.
 
         Args:
-            default: Text of the error if every record is valid.
-            layout: Lengths of the vectors. None accepts all lengths.
+            default: Message of the error if every record is valid.
+            layout: Lengths of the vectors. If None, all lengths are accepted.
 
         Returns:
-            The error that occurs if that record is decoded alone.
+            The error that occurs when that record is decoded alone.
         """
         for payload in self._payloads:
             try:
@@ -244,13 +238,13 @@ class RecordColumns:
 def _find_decoder(
     fields: tuple[str, ...], layout: Layout | None
 ) -> msgspec.msgpack.Decoder[Any]:
-    """Returns a decoder for some fields of an encoded record, which skips all other fields.
+    """Returns a decoder for selected fields of an encoded record, which skips all others.
 
-    This is faster than decoding the whole record.
+    This is faster than decoding the complete record.
 
     Args:
         fields: Names of the fields.
-        layout: Lengths that vectors must have. If None, all lengths are accepted.
+        layout: Required lengths of the vectors. If None, all lengths are accepted.
     """
     types = {field.name: field.type for field in msgspec.structs.fields(State)}
     types.update(_TYPES)
@@ -262,10 +256,10 @@ def _find_decoder(
 
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    """Creates a decoder for some fields of encoded records. Other fields are skipped.
+    """Creates a decoder for selected fields of encoded records, which skips all others.
 
     Args:
-        types: Types of the fields, by name.
+        types: Maps the name of each field to its type.
     """
     fields: list[Any] = []
     for name, kind in types.items():

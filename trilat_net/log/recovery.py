@@ -1,17 +1,17 @@
 """Recovers a damaged or unfinished MCAP file into a new, finished file.
 
 An MCAP file stores messages in compressed chunks, most of them with a checksum. Any MCAP file
-is accepted. For a log of trilat-net, the numbers of received and missing messages (the
-accounts) are computed again from its messages.
+is accepted. For a log of trilat-net, the accounts (counts of received and missing messages) are
+recomputed from its messages.
 
 Invariant:
-    - Everything that can be read is copied byte for byte: messages with their times and
-      numbers, metadata and attachments. Everything else is left out and reported.
-    - Nothing is invented. A message of a trilat-net log is copied only if a valid checksum
-      covers it or if its content proves that it is genuine (`content_check`), and only from a
-      chunk that is in its original place (`recovery_survey`).
+    - Everything readable is copied byte for byte: messages with their times and numbers,
+      metadata and attachments. Everything else is left out and reported.
+    - Nothing is invented. A message of a trilat-net log is copied only if it is covered by a
+      valid checksum or proved genuine by its content (`content_check`), and only from a chunk
+      in its original place (`recovery_survey`).
     - The new file is never empty. If nothing can be saved, no file is created.
-    - The new file is read again. If no command of trilat-net can open it, this is reported.
+    - The new file is read back. If no command of trilat-net can open it, this is reported.
     - The source file is not changed.
 """
 
@@ -53,19 +53,19 @@ from .running_digest import DIGESTS, RECOVERED, DigestState
 from .session_accounts import SessionAccounts
 from .torn_chunk import TornChunk
 
-_UNOPENED = "other MCAP programs open the new file, commands of trilat-net do not"
+_UNOPENED = "other MCAP programs can open the new file, but trilat-net cannot"
 _UNPROVEN = "has no checksum, and the log has no scenario by which to check messages"
 _NO_SCENARIO = "the log has no scenario, without which no message can be checked"
 _MAX_REASONS = 3
-"""Number of losses that the error message lists if nothing can be saved."""
+"""Maximum number of losses listed in the error message if nothing can be saved."""
 _MAX_LISTED_LOSSES = 20
-"""Number of losses that the metadata of the new file list one by one."""
+"""Maximum number of losses listed individually in the metadata of the new file."""
 _DAMAGED_SUFFIX = ".damaged"
-"""Suffix of the name of an attachment whose checksum is wrong."""
+"""Suffix added to the name of an attachment whose checksum is wrong."""
 _MAX_SCENARIO_BYTES = 64 << 20
-"""Largest size of a scenario file beside the log, in bytes."""
+"""Maximum size of a scenario file next to the log, in bytes."""
 _MAX_NUMBERS = 65_535
-"""Largest number of channels in a file, because the format numbers them with 16 bits."""
+"""Maximum number of channels in a file, because the format numbers them with 16 bits."""
 _REGENERATED = frozenset(
     {Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.STATISTICS}
     | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
@@ -75,22 +75,21 @@ _REGENERATED = frozenset(
 
 @dataclass(repr=False)
 class Recovery(Result):
-    """Result of the recovery of a damaged log: what was copied and what was lost.
+    """Result of recovering a damaged log: what was copied and what was lost.
 
     Attributes:
         path: The source file.
         output: The new file.
         finished: True if the source file had been finished.
         messages: Number of messages in the new file.
-        duration_s: Time from the first to the last message, by their arrival, in s.
-        salvaged: Number of messages that were saved from a last chunk that was cut off.
-        lost: A sentence for each loss.
+        duration_s: Time between the arrivals of the first and the last message, in s.
+        salvaged: Number of messages saved from a truncated last chunk.
+        lost: One sentence per loss.
         lost_bytes: Number of bytes that could not be read.
-        missing: A line for each site (arm controller) whose records are incomplete in the new
-            file, either because they were lost in the source file or because they were never
-            recorded.
-        coverage: Numbers of records in the new file and of ticks (control periods) in the run,
-            by site. Empty if the source is not a log of trilat-net.
+        missing: One line per site whose records are incomplete in the new file, either because
+            they were lost in the source file or because they were never recorded.
+        coverage: Number of records in the new file and of ticks in the run, per site. Empty if
+            the source is not a log of trilat-net.
         chain: Result of comparing the source with its digests. Empty if the source is not a log
             of trilat-net.
     """
@@ -111,16 +110,15 @@ class Recovery(Result):
     def lossless(self) -> bool:
         """True if the recovered file contains everything that the damaged file contains.
 
-        The value is False if some bytes could not be read or assigned. `lost` then describes
-        them.
+        False if some bytes could not be read or assigned, in which case `lost` describes them.
         """
         return not self.lost
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result of the recovery of a damaged log as plain values, for JSON.
+        """Returns the result of recovering a damaged log as plain values, for JSON.
 
-        `trilat log recover --json` prints them. The entries say what was saved ("messages",
-        "coverage"), and what was lost ("lost_bytes", "missing").
+        This is the output of `trilat log recover --json`. The entries state what was saved
+        ("messages", "coverage") and what was lost ("lost_bytes", "missing").
         """
         return {
             "file": self.path.as_posix(),
@@ -142,20 +140,21 @@ class Recovery(Result):
         }
 
     def add_loss(self, text: str, size: int = 0) -> None:
-        """Notes that a part of the damaged file was lost, for the report to the user.
+        """Adds the loss of a part of the damaged file to the report for the user.
 
         Args:
             text: Sentence that describes the loss to the user.
-            size: Size of the part that cannot be read, in bytes. 0 if something else was lost.
+            size: Number of bytes that cannot be read. 0 if the loss is not a range of bytes.
         """
         self.lost.append(text)
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns a summary of what was recovered and what was lost, as strings by name.
+        """Summarises what was recovered and what was lost, as a dictionary of strings.
 
-        The summary is stored as metadata in the recovered file: the source file, the losses
-        and the missing records. A reader can thus recognise the file as a recovered log.
+        The summary is stored in the metadata of the recovered file, so that readers can
+        recognise the file as a recovered log. It states the source file, the losses and the
+        missing records.
         """
         losses = self.lost[:_MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
@@ -174,13 +173,12 @@ class Recovery(Result):
 
 
 def recovered_path(path: Path) -> Path:
-    """Chooses the name of the recovered file, if the user gives none.
+    """Returns the default name of the recovered file.
 
-    For an unfinished log run.mcap.active it is run.mcap, and for run.mcap it is
-    run.recovered.mcap.
+    This is run.mcap for an unfinished log run.mcap.active, and run.recovered.mcap for run.mcap.
 
     Args:
-        path: The damaged file.
+        path: Path of the damaged file.
     """
     if path.name.endswith(ACTIVE_SUFFIX) and path.name != ACTIVE_SUFFIX:
         return path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
@@ -194,24 +192,24 @@ def recover(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Recovery:
-    """Recovers a damaged or unfinished file into a new file, as `trilat log recover` does.
+    """Recovers a damaged or unfinished file into a new file, like `trilat log recover`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("torn.mcap")
     >>> tn.recover(path, "whole.mcap").lossless
     True
 
     Args:
-        file: The source file.
-        out: The new file. By default, its name is derived from the source, see
+        file: Path of the source file.
+        out: Path of the new file. By default, it is derived from the source, see
             `recovered_path`.
-        force: True if the new file may replace an existing file.
+        force: True to allow replacing an existing file.
         progress: Function that is called after every record of the source file.
 
     Raises:
         LogError: The source file cannot be read.
         NothingSaved: Nothing could be recovered.
-        UsageError: The new file exists already or cannot be created.
-        LogRefused: The disk refused the data. No file was created.
+        UsageError: The new file already exists or cannot be created.
+        LogRefused: Writing to the disk failed. No file was created.
     """
     path = Path(file)
     if not path.name:
@@ -239,12 +237,12 @@ def _recover(
 ) -> Recovery:
     """Recovers an opened source file.
 
-    The new file has a working name until it is complete. If the recovery fails, it is removed.
+    The new file has a working name until it is complete. If the recovery fails, it is deleted.
 
     Args:
         stream: The source file, opened for reading.
-        result: The result, with the names of the files. It is completed.
-        force: True if the new file may replace an existing file.
+        result: Result with the names of the files, to be completed.
+        force: True to allow replacing an existing file.
         progress: Function that is called after every record of the source file.
 
     Returns:
@@ -252,8 +250,8 @@ def _recover(
 
     Raises:
         NothingSaved: Nothing could be recovered.
-        UsageError: The new file exists already or cannot be created.
-        LogRefused: The disk refused the data.
+        UsageError: The new file already exists or cannot be created.
+        LogRefused: Writing to the disk failed.
     """
     reader = McapReader(stream, str(result.path), progress, kept=False)
     survey = RecoverySurvey(reader.scanner)
@@ -280,7 +278,7 @@ def _recover(
 
 
 def _check_output(working: Path, result: Recovery) -> None:
-    """Opens the recovered file as a test, and adds a loss to the result if this fails.
+    """Tries to open the recovered file, and adds a loss to the result if this fails.
 
     Args:
         working: The new file, under its temporary name.
@@ -294,14 +292,14 @@ def _check_output(working: Path, result: Recovery) -> None:
 
 
 def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
-    """Looks for a lost scenario in a file beside the log.
+    """Looks for a lost scenario in a file next to the log.
 
-    The metadata of the session contain the hash of the scenario, by which the file is
-    recognised. The text is added to the survey.
+    The file is recognised by the hash of the scenario in the metadata of the session. Its text
+    is added to the survey.
 
     Args:
         survey: Survey of the source file.
-        path: The source file.
+        path: Path of the source file.
 
     Returns:
         The text of the file. Empty if the log contains its scenario, or if there is no such
@@ -320,15 +318,15 @@ def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
 
 
 class _FileCopy:
-    """Copies the contents of a damaged MCAP file, the source, into a new file.
+    """Copies the contents of a damaged MCAP file, the source, to a new file.
 
-    A schema describes the fields of a kind of messages, and a channel is a sequence of such
+    A schema describes the fields of a kind of message, and a channel is a sequence of such
     messages. If the source defines the same number of a schema or channel twice, the first
     definition counts.
 
     Args:
         reader: Reader of the source file.
-        file: The new file.
+        file: Writer of the new file.
         survey: Survey of the source file.
         result: Result of the recovery, to which losses are added.
 
@@ -390,12 +388,11 @@ class _FileCopy:
                 self._open_channel(number)
 
     def run(self, restored: bytes) -> None:
-        """Copies everything that can be read from a damaged log into a new file.
+        """Copies everything readable from a damaged log to a new file.
 
         Args:
-            restored: Text of the scenario (the description of the experiment), from a file
-                beside the damaged log. It is written first. Empty if the log itself contains
-                its scenario.
+            restored: Text of the scenario, from a file next to the damaged log. Written first.
+                Empty if the log itself contains its scenario.
 
         Raises:
             NothingSaved: Nothing could be copied.
@@ -434,7 +431,7 @@ class _FileCopy:
         self._finish()
 
     def _copy_or_report(self, record: ScannedRecord) -> None:
-        """Copies one record of the source, or adds it to the losses if it cannot be read."""
+        """Copies one record of the source, or reports it as a loss if it cannot be read."""
         try:
             self._copy_record(record)
         except UnreadableRecord as error:
@@ -444,7 +441,7 @@ class _FileCopy:
             )
 
     def _report_damage(self, damage: Damage) -> None:
-        """Adds a damaged part of the file to the losses that the report on the recovery states.
+        """Adds a damaged part of the file to the losses in the report on the recovery.
 
         A damaged part after the end of the data is not a loss, because it contains only the
         index, which is rebuilt.
@@ -453,9 +450,9 @@ class _FileCopy:
             self._result.add_loss(str(damage), damage.length)
 
     def _copy_record(self, record: ScannedRecord) -> None:
-        """Copies one record of the damaged file into the new one, by a method for its kind.
+        """Copies one record of the damaged file to the new one, using the method for its kind.
 
-        A record is the unit of which an MCAP file consists: a chunk of messages, metadata, an
+        Records are the units that make up an MCAP file: a chunk of messages, metadata, an
         attachment, or a part of an index.
 
         Raises:
@@ -495,10 +492,10 @@ class _FileCopy:
         self._is_empty = False
 
     def _copy_attachment(self, content: bytes) -> None:
-        """Copies a file that is attached to the log, such as the scenario.
+        """Copies a file attached to the log, such as the scenario.
 
-        A damaged attachment is renamed with the suffix `_DAMAGED_SUFFIX`. If the attachment
-        kept its name, nobody would notice the damage, because the writer adds a valid checksum.
+        A damaged attachment is renamed with the suffix `_DAMAGED_SUFFIX`. If it kept its name,
+        nobody would notice the damage, because the writer adds a valid checksum.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
@@ -522,12 +519,12 @@ class _FileCopy:
     def _check_regenerated(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Checks that a record that is not copied really belongs to an index of the file.
 
-        The index of the new file is computed again. If the opcode (the number of the kind) of a
-        record with data is damaged, the record may look like a part of an index, and its loss
-        would not be reported.
+        The index of the new file is computed from scratch. If the opcode of a record with data
+        is damaged, the record may look like a part of an index, and its loss would go
+        unreported.
 
         Args:
-            frame: Kind and place of the record. The kind is one of `_REGENERATED`.
+            frame: Kind and position of the record. The kind is one of `_REGENERATED`.
             content: Content of the record.
 
         Raises:
@@ -545,9 +542,9 @@ class _FileCopy:
             )
 
     def _copy_chunk(self, chunk: ScannedRecord) -> None:
-        """Copies the records of an unpacked chunk, if there is evidence that they are correct.
+        """Copies the records of a chunk if there is evidence that they are correct.
 
-        A chunk is a block of records, mostly with a checksum. There are four cases:
+        A chunk is a block of records, usually with a checksum. There are four cases:
 
         - The chunk has a valid checksum: its records are copied. If the log contains its
           scenario, the first messages must also belong to the run of the log.
@@ -562,7 +559,7 @@ class _FileCopy:
             chunk: The chunk.
 
         Raises:
-            UnreadableRecord: The chunk cannot be unpacked, is not in its original place, is
+            UnreadableRecord: The chunk cannot be decompressed, is not in its original place, is
                 from another run, or cannot be checked.
         """
         data = chunk.unpack()
@@ -599,9 +596,9 @@ class _FileCopy:
             content: Content of the message record.
 
         Raises:
-            UnreadableRecord: The content contradicts the session or cannot be checked, or the
-                file of another program has chunks and a message outside of them, which is the
-                result of damage.
+            UnreadableRecord: The content contradicts the session or cannot be checked. Also
+                raised if the file of another program has chunks and a message outside of them,
+                which only damage can cause.
         """
         if self._content is not None:
             any_time_ns = (0, _LAST_NS)  # no chunk limits the time of the message
@@ -616,11 +613,11 @@ class _FileCopy:
     def _copy_chunk_record(self, opcode: int, content: bytes) -> None:
         """Copies a message of a chunk to the new file, or stores a definition for later.
 
-        Definitions are those of schemas and channels. They are written when a message needs
-        them. Other kinds of records are ignored.
+        Definitions describe schemas and channels, and are written when a message needs them.
+        Other kinds of records are ignored.
 
         Args:
-            opcode: Number of the record's kind.
+            opcode: Opcode of the record.
             content: Content of the record.
 
         Raises:
@@ -661,8 +658,8 @@ class _FileCopy:
         All records are checked before the first one is copied.
 
         Args:
-            records: Kinds and contents of the records of a chunk.
-            span_ns: First and last arrival time of the chunk, in Unix time, in ns.
+            records: Opcodes and contents of the records of a chunk.
+            span_ns: First and last arrival time of the chunk in Unix time, in ns.
 
         Raises:
             UnreadableRecord: A record may be damaged. No record was copied.
@@ -674,20 +671,20 @@ class _FileCopy:
             self._copy_chunk_record(opcode, content)
 
     def _check_unproven(self, opcode: int, content: bytes, span_ns: tuple[int, int]) -> None:
-        """Checks a record that no checksum covers, by what its content states.
+        """Checks a record that is not covered by a checksum, based on its content.
 
         In the log of a session, a message states its sender, its number and its time, which
-        must agree with its channel, with the previous messages and with the scenario
-        (`content_check`). Messages of other programs contain no such statements. For these
-        messages, only the arrival time is compared with the time range of the chunk.
+        must match its channel, the previous messages and the scenario (`content_check`).
+        Messages of other programs contain no such statements, so only the arrival time is
+        compared with the time range of the chunk.
 
         Args:
             opcode: Kind of the record.
             content: Content of the record.
-            span_ns: First and last arrival time of the chunk, in Unix time, in ns.
+            span_ns: First and last arrival time of the chunk in Unix time, in ns.
 
         Raises:
-            UnreadableRecord: The content contradicts its place in the file.
+            UnreadableRecord: The content contradicts its position in the file.
         """
         if opcode in mcap_records.DEFINITIONS:
             self._check_unproven_definition(opcode, content)
@@ -721,19 +718,19 @@ class _FileCopy:
             )
 
     def _check_unproven_definition(self, opcode: int, content: bytes) -> None:
-        """Checks a schema or channel that no checksum covers, and adds it to the definitions.
+        """Checks a schema or channel without a checksum, and adds it to the definitions.
 
-        The topic of a channel may show for the first time that the file is the log of a
-        session. If its scenario is missing, the messages of the session cannot be checked, and
-        no further messages without a checksum are copied.
+        The topic of a channel may be the first evidence that the file is the log of a session.
+        If its scenario is missing, the messages of the session cannot be checked, and no
+        further messages without a checksum are copied.
 
         Args:
             opcode: Kind of the definition: schema or channel.
             content: Content of the definition.
 
         Raises:
-            UnreadableRecord: A channel belongs to no member (process of a session) of this
-                session, or to a session whose scenario is missing.
+            UnreadableRecord: A channel belongs to no member of this session, or to a session
+                whose scenario is missing.
         """
         entry = mcap_records.parse_record(opcode, content)
         if opcode == Opcode.CHANNEL:
@@ -760,7 +757,7 @@ class _FileCopy:
             self._contradicted.add(entry.id)
 
     def _is_plausible(self, topic: str) -> bool:
-        """Returns True if a topic can occur in the log that is recovered.
+        """Returns True if a topic can occur in the log being recovered.
 
         Damaged bytes can look like a valid topic. The log of a session, for example, contains
         no topics of other sessions.
@@ -770,13 +767,13 @@ class _FileCopy:
         return self._content.owns_channel(topic)
 
     def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
-        """Finds the channel of the new file for a message of the source, or registers it.
+        """Finds or registers the channel of the new file for a message of the source.
 
         In the log of a session, the first message of a channel determines the channel, because
         a message names its sender and its kind. The definition of the channel is less reliable,
-        because no checksum covers it in a file that was not finished. If the two contradict
-        each other, a new channel is defined from the message, and its topic is noted as a loss.
-        Further messages of the channel are then assigned to the same new channel.
+        because no checksum covers it in an unfinished file. If the two contradict each other, a
+        new channel is defined from the message, and its topic is reported as a loss. Further
+        messages of the channel are then assigned to the same new channel.
 
         Args:
             number: Channel number in the source.
@@ -809,10 +806,10 @@ class _FileCopy:
         return channel
 
     def _open_channel(self, number: int) -> tuple[int, str] | None:
-        """Registers a channel in the new file, with the definition of the damaged file.
+        """Registers a channel in the new file, using the definition in the damaged file.
 
         The schema of the channel, which describes the fields of its messages, is registered
-        before the channel.
+        first.
 
         Args:
             number: Channel number in the damaged file.
@@ -867,11 +864,11 @@ class _FileCopy:
     def _register_copy(
         self, number: int | None, new_number: int, topic: str
     ) -> tuple[int, str]:
-        """Stores which channel of the new file receives the messages of a damaged channel.
+        """Records which channel of the new file receives the messages of a damaged channel.
 
-        A message is assigned to its channel by the channel number that is stored with it in the
-        damaged file. If that number is wrong, it is assigned by its topic, which follows from
-        the sender and the kind that are stated in the message itself.
+        A message is assigned to its channel by the channel number stored with it in the damaged
+        file. If that number is wrong, it is assigned by its topic, which follows from the
+        sender and the kind stated in the message itself.
 
         Args:
             number: Channel number in the source. None if the source does not define the
@@ -880,7 +877,7 @@ class _FileCopy:
             topic: Topic of the channel.
 
         Returns:
-            The channel number in the new file, and the topic, as the caller returns them.
+            The channel number in the new file, and the topic, in the form that callers return.
         """
         channel = new_number, topic
         if number is not None:
@@ -895,8 +892,9 @@ class _FileCopy:
     def _copy_torn_chunk(self, torn: Damage) -> None:
         """Copies the messages that can be read from the last chunk, if it is incomplete.
 
-        The rest of the chunk, or the whole record if it is not a chunk, is added to the losses.
-        An incomplete index is not a loss, because the index of the new file is computed again.
+        The rest of the chunk, or the complete record if it is not a chunk, is reported as a
+        loss. An incomplete index is not a loss, because the index of the new file is computed
+        from scratch.
 
         Args:
             torn: The incomplete last record of the file. Its length is 0 if the file ends
@@ -925,18 +923,18 @@ class _FileCopy:
         )
 
     def _salvage(self, offset: int) -> str:
-        """Copies the records of an incomplete chunk that can still be unpacked.
+        """Copies the records of an incomplete chunk that can still be decompressed.
 
-        The chunk was compressed in blocks, which can be unpacked one after another up to the
-        place where the file ends. The checksum of the chunk also covers the missing part, so it
-        cannot be used. Therefore each message must be checked by its content. In the log of a
-        session this requires the scenario.
+        The chunk was compressed in blocks, which can be decompressed one after another up to
+        the place where the file ends. The checksum of the chunk also covers the missing part,
+        so it cannot be used. Each message must therefore be checked by its content, which
+        requires the scenario in the log of a session.
 
         Args:
             offset: Offset of the chunk in the source file.
 
         Returns:
-            The problem that ended the copy, as a string for the user. Empty if all blocks were
+            The problem that ended the copy, for display to the user. Empty if all blocks were
             copied.
         """
         can_check_messages = self._content is not None or not self.is_session_log
@@ -952,10 +950,10 @@ class _FileCopy:
         return ""
 
     def _report_final_losses(self) -> None:
-        """Adds the losses that are known only after the whole damaged file was read.
+        """Adds the losses that are known only after the complete damaged file has been read.
 
-        Messages of a channel without a definition are an example, because a definition may
-        follow its messages.
+        One example is messages of a channel without a definition, since a definition may follow
+        its messages.
         """
         result = self._result
         for number, count in self._unnamed.items():
@@ -1001,16 +999,16 @@ class _FileCopy:
         self._result.lost.insert(0, f"{loss}; {_UNOPENED}{advice}")
 
     def _finish(self) -> None:
-        """Finishes the new file, and the result of the recovery, after all messages are copied.
+        """Finishes the new file and the result of the recovery, after all messages are copied.
 
-        These are written at the end of the new file:
+        The following are written at the end of the new file:
 
         - the accounts: how many messages of each channel are in the new file, and how many are
           missing (only if the source is the log of a session with a readable scenario),
-        - the facts of the recovery: the name of the source, the losses, and whether the source
-          agreed with its digests, the checksums of its contents,
-        - digests of the new file, by which later changes are noticed (only with accounts),
-        - the index and the end mark of the format MCAP.
+        - the facts about the recovery: the name of the source, the losses, and whether the
+          source matched its digests, the checksums of its contents,
+        - digests of the new file, which reveal later modifications (only with accounts),
+        - the index and the end mark of the MCAP format.
         """
         result = self._result
         accounts = self._accounts
@@ -1050,12 +1048,12 @@ class _FileCopy:
     ) -> bool:
         """Returns True if the message counts in the source differ from those of its records.
 
-        They can be compared only if the source is a finished log in one file without losses.
+        They can be compared only if the source is a finished log in one file with no losses.
         Otherwise the counts may include records that the new file lacks.
 
         Args:
-            accounts: Counts that were computed from the copied messages.
-            source_accounts: Counts that the source states, by topic.
+            accounts: Counts computed from the copied messages.
+            source_accounts: Maps each topic to the counts stated in the source.
         """
         is_complete = self._scanner.finished and self._result.lossless
         if not is_complete or PART in self._survey.metadata:
@@ -1069,19 +1067,18 @@ class _FileCopy:
         return False
 
     def _judge_source_chain(self) -> DigestState:
-        """Compares the source with the digests that it states, to reveal later changes.
+        """Compares the source with the digests that it states, to reveal later modifications.
 
-        A log states two digests (checksums): one of its messages, and one of the definitions of
-        its schemas and channels and of its metadata. Both are compared.
+        A log states two digests (checksums): one of its messages, and one of its metadata and
+        the definitions of its schemas and channels. Both are compared.
 
         A definition is stored twice: among the data, and in the summary at the end of the file.
         If it was damaged among the data, but is intact in the summary, the second digest
         differs, although no message was changed. The recovery then uses the intact definition,
-        so the source counts as damaged (OPEN) and not as changed by somebody.
+        so the source counts as damaged (OPEN) rather than modified by somebody.
 
         Returns:
-            The result, see `DigestState`. It is also OPEN if the file lacks its first bytes,
-            which mark it as an MCAP file.
+            The result, see `DigestState`. Also OPEN if the file lacks its magic bytes.
         """
         has_first_mark = self._scanner.begins
         if not has_first_mark:
@@ -1096,13 +1093,13 @@ class _FileCopy:
 
 
 _LAST_NS = (1 << 64) - 1
-"""Latest time that a message can have, in ns: times have 64 bits."""
+"""Latest possible time of a message, in ns, because times have 64 bits."""
 
 
 def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
-    """Decodes the first fields of an MCAP message: its channel, its number and both times.
+    """Decodes the header of an MCAP message, with times in ns.
 
-    The result has the channel number, sequence number, arrival time and sending time.
+    Returns the channel number, sequence number, arrival time and sending time.
 
     Raises:
         UnreadableRecord: The message is too short.
@@ -1118,14 +1115,14 @@ def _create_content_check(
 ) -> ContentCheck | None:
     """Creates a check that recognises intact messages by their content.
 
-    It is used where a damaged file has no checksum.
+    Used where a damaged file has no checksum.
 
     Args:
         survey: Survey of the source file.
         accounts: Accounts of the source. None if the source has no session or no scenario.
 
     Returns:
-        The check. None if there are no accounts.
+        The check, or None if there are no accounts.
     """
     if accounts is None:
         return None

@@ -1,18 +1,17 @@
 """Surveys a damaged MCAP file before its messages are recovered.
 
 The survey collects everything in the file except the messages: the metadata of the session, the
-scenario (the description of the experiment), the definitions of the channels and the index. A
-damaged disk or a damaged copy may contain parts of other files. Therefore the survey also
-decides which parts belong together. It lists the chunks, the compressed blocks of messages,
-that are not in their original places.
+scenario, the definitions of the channels and the index. Since a damaged disk or a damaged copy
+may contain parts of other files, the survey also decides which parts belong together, and lists
+the chunks (compressed blocks of messages) that are not in their original places.
 
 Invariant:
     - If a schema or channel is defined twice with the same number, the definition with a valid
       checksum is used. Without a checksum, the first definition is used.
     - If a file contains several sessions and scenarios, the survey selects a session and a
       scenario that refer to each other. A session whose start time contradicts all messages
-      with a checksum belongs to another log and is rejected. In simulated time all sessions
-      start at 0. In this case, the numbers that identify the starts of the sites are compared
+      with a checksum belongs to another log and is rejected. In simulated time, where all
+      sessions start at 0, the numbers that identify the starts of the sites are compared
       instead.
     - A chunk with a valid checksum may still be outdated, from another file, or in the wrong
       place. In a finished file, the index shows which chunks belong to it. In an unfinished
@@ -39,44 +38,47 @@ from .mcap_records import ChunkHead, RecordFrame, UnreadableRecord
 from .torn_chunk import PAGE_BYTES
 
 Definition = tuple[int, bytes]
-"""Record that defines a schema or a channel: its opcode and its content."""
+"""Record that defines a schema or a channel, as its opcode and content."""
 _PROGRAM = "trilat-net"
 _TOPIC_ROOT = f"/{topics.ROOT}/".encode()
 _SAMPLED_CHUNKS = 16
-"""Number of chunks, from the first one, whose messages are compared with the session."""
+"""Number of chunks at the start of the file whose messages are compared with the session."""
 
 
 class RecoverySurvey:
     """Everything in a damaged file except its messages: metadata, definitions and chunks.
 
-    The recovery creates this object first, and then copies the messages to a new file.
+    The recovery creates this object before it copies the messages to a new file.
 
     Args:
         scanner: Scanner that finds the records of the file.
 
     Attributes:
         is_finished: True if the file has an end mark.
-        trailing_bytes: Number of bytes behind the end mark.
+        trailing_bytes: Number of bytes after the end mark.
         profile: Profile in the header of the MCAP file.
         library: Program that wrote the file, as stated in the header.
         definitions: Schemas and channels that are defined outside of chunks.
-        metadata: Metadata by name. If a name occurs repeatedly, the last entry counts. Of
-            several sessions, the one that names the scenario counts.
-        attachments: Attachments by name. If a name occurs repeatedly, the first entry counts.
-            Of several scenarios, the one that the session names counts.
-        count: Number of messages that the file states. None if no valid checksum covers it.
-        is_redefined: True if a definition among the data differs from that in the summary at
-            the end of the file, which a checksum covers.
-        is_foreign_session: True if the file names another session than its messages.
-        misplaced: Description of the problem for each chunk that is not in its original place,
-            by the offset of the chunk.
+        metadata: Maps the name of each metadata record to its contents. If a name occurs
+            repeatedly, the last entry counts. If there are several sessions, the one that names
+            the scenario counts.
+        attachments: Maps the name of each attachment to its contents. If a name occurs
+            repeatedly, the first entry counts. If there are several scenarios, the one named by
+            the session counts.
+        count: Number of messages stated in the file. None if it is not covered by a valid
+            checksum.
+        is_redefined: True if a definition among the data differs from the one in the summary at
+            the end of the file, which is covered by a checksum.
+        is_foreign_session: True if the file names a session other than that of its messages.
+        misplaced: Maps the offset of each chunk that is not in its original place to a
+            description of the problem.
         is_chunked: True if the file contains chunks.
         is_session_log: True if anything in the file shows that it is the log of a session.
         why_empty: Reason why there is nothing to recover. Empty if something can be recovered.
     """
 
     def __init__(self, scanner: mcap_records.RecordScanner) -> None:
-        """Reads a damaged file once, and selects those parts of it that belong to one log."""
+        """Reads a damaged file once, and selects the parts that belong to one log."""
         self.profile = ""
         self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
@@ -118,13 +120,13 @@ class RecoverySurvey:
 
     @classmethod
     def of_unfinished_file(cls, path: Path) -> "RecoverySurvey | None":
-        """Reads a file for what can be recovered if its end is missing or damaged.
+        """Surveys what can be recovered from a file whose end is missing or damaged.
 
         Args:
-            path: The file.
+            path: Path of the file.
 
         Returns:
-            The survey. None if the file ends as it should.
+            The survey, or None if the file ends properly.
 
         Raises:
             LogError: The file cannot be read.
@@ -176,10 +178,10 @@ class RecoverySurvey:
     ) -> None:
         """Chooses between the definitions in the summary and those among the data.
 
-        A checksum covers the definitions in the summary. Therefore they are preferred.
+        The definitions in the summary are preferred, because they are covered by a checksum.
 
         Args:
-            definitions_by_kind: Definitions, by (True in the summary, opcode).
+            definitions_by_kind: Maps (True if in the summary, opcode) to definitions.
         """
         self.is_redefined = False
         for kind in mcap_records.DEFINITIONS:
@@ -204,11 +206,11 @@ class RecoverySurvey:
 
         Such a record is a header, metadata, an attachment, the statistics or an entry of the
         chunk index. A damaged file may contain several sessions and scenarios. All of them are
-        collected, and `_choose_session` chooses later. Of other attachments with the same name,
-        the first one counts.
+        collected, and `_choose_session` chooses later. Among other attachments with the same
+        name, the first one counts.
 
         Args:
-            frame: Place of the record.
+            frame: Position of the record.
             content: Content of the record.
 
         Raises:
@@ -237,11 +239,11 @@ class RecoverySurvey:
     def _choose_session(self) -> None:
         """Chooses the session and the scenario that belong together.
 
-        The metadata of a session contain the SHA-256 of its scenario. The first session whose
-        scenario is in the file is chosen, together with that scenario.
+        The metadata of a session contain the SHA-256 hash of its scenario. The first session
+        whose scenario is in the file is chosen, together with that scenario.
 
-        If there is no such pair, the first session and the first scenario that a checksum
-        covers are chosen. A checksum of 0 covers nothing, because a page of zeros may have
+        If there is no such pair, the first session and the first scenario that are covered by a
+        checksum are chosen. A checksum of 0 covers nothing, because a page of zeros may have
         replaced the original page of the file.
         """
         self.attachments.pop(SCENARIO, None)
@@ -265,10 +267,10 @@ class RecoverySurvey:
     def _judge_messages(self) -> None:
         """Removes the session that the file names, if the messages belong to another session.
 
-        The messages of the first chunks are decoded. They show to which session they belong, by
-        its epoch (start time) and by the boots of their senders, the numbers that identify the
-        starts of the processes. Only chunks with a checksum are evidence against the named
-        session. Any chunk may show that the file is the log of a session at all.
+        The messages of the first chunks are decoded. Their epoch (start time) and the boots of
+        their senders, which identify the starts of the processes, show which session they
+        belong to. Only chunks with a checksum are evidence against the named session. Any chunk
+        may show that the file is the log of a session at all.
 
         If the epochs differ, the named session is a different one, usually with a different
         name. If only the boots differ, as in simulated time, where all epochs are 0, the two
@@ -296,13 +298,13 @@ class RecoverySurvey:
             self._reject_session(named_session, is_renamed=False)
 
     def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:
-        """Removes a session from the survey that belongs to another log than the messages.
+        """Removes from the survey a session that belongs to another log than the messages.
 
         This happens if a damaged disk has overwritten a page of the file with a page of another
-        file. A page is a block of `PAGE_BYTES`, which is always overwritten as a whole. The
+        file. A page is a block of `PAGE_BYTES` that is always overwritten as a unit. The
         foreign page contains the metadata of its session, and may contain definitions of its
-        channels. These definitions are removed as well, and so is the scenario, the description
-        of the experiment. A definition that a checksum covers is genuine and is kept.
+        channels. These definitions and the scenario are removed too. A definition that is
+        covered by a checksum is genuine and is kept.
 
         Args:
             session: Metadata of the foreign session.
@@ -323,9 +325,9 @@ class RecoverySurvey:
         def is_genuine(definition: Definition) -> bool:
             """Returns True if a definition may belong to the session of the messages.
 
-            Definitions with a valid checksum do. Other definitions are foreign if they name the
-            rejected session, and if they lie in a page with foreign data or the session was
-            renamed.
+            This holds for all definitions with a valid checksum. Any other definition is
+            foreign if it names the rejected session and either lies in a page with foreign data
+            or the session was renamed.
             """
             offset = self._uncovered_offsets.get(definition)
             if offset is None:  # a checksum covers the definition
@@ -339,10 +341,10 @@ class RecoverySurvey:
         self.definitions = list(filter(is_genuine, self.definitions))
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
-        """Finds chunks (blocks of messages) of a damaged file that are at a wrong position.
+        """Finds chunks of a damaged file that are in the wrong place.
 
         Returns:
-            A description of the problem for each of these chunks, by the offset of the chunk.
+            Maps the offset of each such chunk to a description of the problem.
         """
         if self._chunk_indexes:
             return self._find_unnamed_chunks()
@@ -358,15 +360,15 @@ class RecoverySurvey:
         }
 
     def _find_unnamed_chunks(self) -> dict[int, str]:
-        """Finds the chunks (blocks of messages) that the index of the file does not name.
+        """Finds the chunks that are not listed in the index of the file.
 
         Such a chunk may come from an older file in the same part of the disk. If bytes were
-        inserted or removed, chunks have other offsets than the index states. Therefore a chunk
-        is also accepted if the index names a missing chunk with the same sizes and times at
-        another offset.
+        inserted or removed, chunks have other offsets than the index states. A chunk is
+        therefore also accepted if the index lists a missing chunk with the same sizes and times
+        at another offset.
 
         Returns:
-            A description of the problem for each of these chunks, by the offset of the chunk.
+            Maps the offset of each such chunk to a description of the problem.
         """
         unmatched_entries = Counter(
             _chunk_measures(index) for index in self._chunk_indexes.values()
@@ -393,7 +395,7 @@ class RecoverySurvey:
 def _find_intact_summary(scanner: mcap_records.RecordScanner) -> int:
     """Returns the offset of the summary at the end of an MCAP file, if its checksum is valid.
 
-    If the summary is missing or damaged, the size of the file is returned.
+    Returns the size of the file if the summary is missing or damaged.
     """
     footer = scanner.footer()
     if footer is None or not footer.summary_crc or not scanner.is_summary_intact(footer):
@@ -402,7 +404,7 @@ def _find_intact_summary(scanner: mcap_records.RecordScanner) -> int:
 
 
 def _names_session(data: bytes) -> bool:
-    """Returns True if an unpacked chunk defines a channel of a session."""
+    """Returns True if an uncompressed chunk defines a channel of a session."""
     records = mcap_records.iterate_records(data)
     return any(
         opcode == Opcode.CHANNEL and _TOPIC_ROOT in data[begin:end]
@@ -417,7 +419,7 @@ _DESCRIBING = frozenset(
 
 
 def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
-    """Returns the sizes and the times of a chunk, as an entry of the index states them."""
+    """Returns the sizes and times of a chunk, as stated in an entry of the index."""
     return (
         index.chunk_length,
         index.uncompressed_size,
@@ -429,10 +431,10 @@ def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
 def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
     """Finds the longest increasing sequence in a list of time spans.
 
-    The chunks of a log are in the order of time, so a chunk outside of the sequence is probably
-    in the wrong place. The method is patience sorting, with O(K log K) comparisons for K spans.
-    The sequence increases strictly, because equal spans belong to a chunk that the file
-    contains twice.
+    The chunks of a log are in chronological order, so a chunk outside of the sequence is
+    probably in the wrong place. The method is patience sorting, with O(K log K) comparisons for
+    K spans. The sequence is strictly increasing, because equal spans belong to a chunk that the
+    file contains twice.
 
     Args:
         spans_ns: First and last time of each chunk, in ns.

@@ -1,16 +1,16 @@
-"""Computes the digests of a log, which reveal that the log was changed after it was recorded.
+"""Computes the digests of a log, which reveal whether it was modified after recording.
 
 A log contains two SHA-256 digests: one of all messages in order, and one of everything that
 describes the messages (metadata, scenario, schemas and channels). If a log has several parts,
-each part repeats the digest of the previous one. Therefore the digests form a chain. The
-digests reveal alterations. They cannot show that a whole file was rewritten with new digests.
-Signatures protect against this (`log_signature`).
+each part repeats the digest of the previous one, so the digests form a chain. The digests
+reveal modifications, but not that a whole file was rewritten with new digests. Signatures
+protect against this (`log_signature`).
 
 Invariant:
-    - The digests depend on the records of the file, and not on their division into chunks or on
+    - The digests depend on the records of the file, but not on their division into chunks or on
       the compression.
-    - Any change of a message, of its times or number, of metadata, scenario, schema or channels
-      changes one of the digests.
+    - Any modification of a message, of its times or number, or of metadata, scenario, schema or
+      channels changes one of the digests.
 """
 
 import hashlib
@@ -22,24 +22,24 @@ from ..errors import count_nouns
 from .log_layout import SESSION
 
 DIGESTS = "trilat.chain"
-"""Name of the metadata with the digests, at the end of a log."""
+"""Name of the metadata record with the digests, at the end of a log."""
 DIGESTS_KEY = "digest_chain"
-"""Key of the session's metadata that announces the digests and names their algorithm."""
+"""Key of the session metadata that announces the digests and names their algorithm."""
 ALGORITHM = "sha256"
 """Name of the algorithm."""
 RECOVERED = "trilat.recovered"
-"""Name of the metadata that describe the source and the losses of a recovered log."""
+"""Name of the metadata record that describes the source and the losses of a recovered log."""
 PREVIOUS_DIGEST_KEY = "previous_records"
-"""Key of a part's metadata with the digest of the messages in the previous part."""
+"""Key, in the metadata of a part, of the digest of the messages in the previous part."""
 
 
 class DigestState(StrEnum):
-    """Result of comparing a file with its digests, in order from the best to the worst.
+    """Result of comparing a file with its digests, ordered from best to worst.
 
-    A digest is a checksum of the contents, which reveals changes.
+    A digest is a checksum of the contents that reveals modifications.
 
-    - INTACT: The file agrees with its digests.
-    - ABSENT: The file has no digests, because an old program wrote it.
+    - INTACT: The file matches its digests.
+    - ABSENT: The file has no digests, because it was written by an old version of the program.
     - OPEN: The file was not finished or is damaged, and cannot be compared.
     - CHANGED: The file differs from its digests, or the digests were removed.
     """
@@ -51,13 +51,13 @@ class DigestState(StrEnum):
 
 
 class Integrity(NamedTuple):
-    """States whether a log agrees with its digests, checksums that reveal changes.
+    """States whether a log matches its digests, checksums that reveal modifications.
 
-    Every certificate and check mentions the result, because a changed log proves nothing.
+    Every certificate and check reports this, because a modified log proves nothing.
 
     Attributes:
         state: The result of the comparison.
-        text: A sentence for the user that explains it.
+        text: A sentence that explains the result to the user.
     """
 
     state: DigestState
@@ -65,10 +65,10 @@ class Integrity(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """False only if something in the file was changed or removed after it was recorded.
+        """False only if something in the file was modified or removed after it was recorded.
 
-        A file without digests, or a file that was not finished, cannot be compared. It passes,
-        because there is no evidence against it.
+        A file without digests, or an unfinished file, cannot be compared. It passes, because
+        there is no evidence against it.
         """
         return self.state is not DigestState.CHANGED
 
@@ -76,7 +76,7 @@ class Integrity(NamedTuple):
 class RunningDigest:
     """Computes the digests (SHA-256 checksums) of one file while it is written or read.
 
-    One digest covers the messages, and the other one everything that describes them.
+    One digest covers the messages, the other everything that describes them.
 
     Attributes:
         messages: Number of messages added so far.
@@ -90,10 +90,10 @@ class RunningDigest:
         self._descriptions: set[bytes] = set()
 
     def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
-        """Updates the hash of a file's messages with further messages, in the file's order.
+        """Updates the hash of a file's messages with further messages, in file order.
 
         Args:
-            data: The messages with their headers, as in an unpacked chunk of the MCAP file.
+            data: The messages with their headers, as in an uncompressed chunk of the MCAP file.
             messages: Number of messages in `data`.
         """
         self._records.update(data)
@@ -105,7 +105,7 @@ class RunningDigest:
         The order of these records does not matter, and repeated records count once.
 
         Args:
-            opcode: Number of the kind of record: header, metadata, attachment, schema or
+            opcode: Identifies the kind of record: header, metadata, attachment, schema or
                 channel.
             content: Content of the record.
         """
@@ -114,12 +114,12 @@ class RunningDigest:
     def facts(self) -> dict[str, str]:
         """Returns the hashes of everything in the file so far, as metadata for the file.
 
-        A reader computes them again, to find out whether the file was changed.
+        A reader recomputes them to find out whether the file was modified.
 
         Returns:
-            Texts by name. "algorithm" is the method, "messages" the number of messages,
-            "records" the checksum of the messages, and "about" the checksum of the records that
-            describe them. The checksums are in hexadecimal digits.
+            A dictionary of strings: "algorithm" (the hash method), "messages" (the number of
+                messages), "records" (the checksum of the messages) and "about" (the checksum of
+                the records that describe them). The checksums are in hexadecimal digits.
         """
         about = hashlib.sha256(b"".join(sorted(self._descriptions))).hexdigest()
         digests = {"records": self._records.hexdigest(), "about": about}
@@ -128,15 +128,16 @@ class RunningDigest:
     def judge(
         self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool
     ) -> Integrity:
-        """Decides from the hashes that a file contains whether the file was changed.
+        """Decides from the hashes stored in a file whether the file was modified.
 
         Args:
-            metadata: All metadata of the file, by name. They contain its digests.
+            metadata: Maps the name of each metadata record of the file, including its digests,
+                to its contents.
             finished: True if the file was finished. A finished file must contain digests.
             damaged: True if a part of the file cannot be read.
 
         Returns:
-            Whether the file agrees with its digests, with an explanation.
+            Whether the file matches its digests, with an explanation.
         """
         stated = metadata.get(DIGESTS)
         recovered = metadata.get(RECOVERED, {})
@@ -174,14 +175,14 @@ class RunningDigest:
 
 
 def _judge_without_chain(*, is_announced: bool, finished: bool) -> Integrity:
-    """Returns the result of checking a file that contains no hashes.
+    """Returns the result of checking a file that contains no digests.
 
     Args:
         is_announced: True if the beginning of the file announces digests.
         finished: True if the file was finished.
     """
     if not is_announced:
-        return Integrity(DigestState.ABSENT, "no digest chain: an older program made it")
+        return Integrity(DigestState.ABSENT, "no digest chain: written by an older program")
     if not finished:
         text = "its digest chain is not closed: the file was not finished"
         return Integrity(DigestState.OPEN, text)
@@ -194,4 +195,6 @@ _COVERED = {
     "records": "its messages",
     "about": "its metadata, scenario, schemas or channels",
 }
-"""Part of the log that has changed if an entry of the digests differs, as a noun phrase."""
+"""Maps each entry of the digests to the part of the log that has changed if the entry differs,
+as a noun phrase.
+"""

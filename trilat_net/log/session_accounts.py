@@ -1,12 +1,13 @@
 """Counts the received and missing messages of all channels of a session.
 
-A channel contains the numbered messages of one kind and sender. `SessionAccounts` has an
-`Account` for each channel. It follows the events with which the arms state which control
-periods exist: when an arm began, which periods it skipped, and when it ended.
+A channel contains the numbered messages of one kind from one sender. `SessionAccounts` has one
+`Account` per channel. It evaluates the events that show which ticks exist: when a site began,
+which ticks it skipped, and when it ended.
 
 Invariant:
     - Only the events of a file are decoded, because they suffice to count its messages.
-    - If a log is divided into several files, a later file is counted from its first message on.
+    - If a log is divided into several files, the counts for a later file begin at its first
+      message.
 """
 
 import re
@@ -31,23 +32,22 @@ from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 _OVERRUN = "overrun"
 """Kind of the event in which a site lists the ticks that it skipped because it was late."""
 _MAX_STARTS = 64
-"""Largest number of starts of a member whose events are counted separately."""
+"""Maximum number of starts of a member whose events are counted separately."""
 _EVENTS_NUMBERED_SINCE = 3
-"""First version of the schema whose events have numbers."""
+"""First version of the schema in which events are numbered."""
 
 
 class SessionAccounts:
     """Counts the received and missing messages of all numbered channels of a session.
 
-    A recorder uses this class while it records, and the check of a log counts with it later.
-    The caller passes every message. From the events, the class learns how many periods (ticks)
-    of its control loop each arm executed.
+    Used by a recorder while it records, and later by the check of a log. The caller passes
+    every message. From the events, the class determines how many ticks each site executed.
 
     Args:
         session: Name of the session.
         scenario: Scenario of the session. None if it cannot be read.
-        continued: True for a later part of a log, which is counted from its first message on.
-        events: True if events have numbers, which they lack in the oldest logs.
+        continued: True for a later part of a log, whose counts begin at its first message.
+        events: True if events are numbered. In the oldest logs they are not.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class SessionAccounts:
         continued: bool = False,
         events: bool = True,
     ) -> None:
-        """Starts the accounts of a session's messages. No message has been counted yet."""
+        """Creates the accounts of a session, with no messages counted yet."""
         self._session = session
         self._continued = continued
         self._rates_hz: dict[str, int] = {}
@@ -85,11 +85,10 @@ class SessionAccounts:
         return "/" + topics.key(self._session, member, channel)
 
     def open_channel(self, topic: str) -> None:
-        """Starts to count the messages of a channel, before its first message has arrived.
+        """Starts counting the messages of a channel before its first message has arrived.
 
-        The losses are then noticed even if no message ever arrives. Nothing happens if the
-        topic does not belong to the session, or if the messages of its channel are not
-        numbered.
+        Losses are then noticed even if no message ever arrives. Does nothing if the topic does
+        not belong to the session, or if the messages of its channel are not numbered.
 
         Args:
             topic: Topic of the channel, such as "/trilat/paper/m1/state".
@@ -103,16 +102,15 @@ class SessionAccounts:
     def receive(self, topic: str, sequence: int, payload: bytes = b"") -> None:
         """Counts one message of a log file.
 
-        The message is ignored if its topic is not counted, because `open_channel` was not
-        called for the topic or the topic does not belong to the session.
+        The message is ignored if its topic is not being counted, because `open_channel` was not
+        called for it or it does not belong to the session.
 
         Args:
             topic: Topic of the message.
-            sequence: Sequence number of the message in the file. For records (results of
-                control periods) and statistics, it is the number of their tick, the period of
-                the control loop.
-            payload: Bytes of the message. Only the bytes of events are used, because events
-                state how many ticks a site (arm controller) executed or skipped.
+            sequence: Sequence number of the message in the file. For records and statistics,
+                this is their tick.
+            payload: Bytes of the message. Needed only for events, which state how many ticks a
+                site executed or skipped.
         """
         if topic not in self._accounts:
             return
@@ -134,12 +132,11 @@ class SessionAccounts:
     def receive_event(self, topic: str, number: int, event: Event) -> bool:
         """Counts an event, and evaluates what it states about the ticks of a site.
 
-        Each start of a site (arm controller) numbers its events from 0. Therefore each start
-        has its own account, the object that counts its events. The boot in the event, a random
-        number, identifies the start. The first start uses the account that `open_channel`
-        created, and `_accounts` refers to the account of the newest start. If there are more
-        than `_MAX_STARTS` starts, which only a faulty sender causes, the newest account counts
-        the events of all further starts.
+        Each start of a site numbers its events from 0, and therefore has its own account. The
+        boot in the event, a random number, identifies the start. The first start uses the
+        account that `open_channel` created, and `_accounts` refers to the account of the newest
+        start. If there are more than `_MAX_STARTS` starts, which only a faulty sender causes,
+        the newest account also counts the events of all further starts.
 
         Args:
             topic: Topic of the event.
@@ -147,7 +144,7 @@ class SessionAccounts:
             event: The event.
 
         Returns:
-            False if the event had been received before.
+            False if the event had already been received.
         """
         starts = self._starts.setdefault(topic, {})
         is_new_start = event.boot not in starts
@@ -170,21 +167,20 @@ class SessionAccounts:
         return is_new
 
     def apply_event(self, event: Event) -> None:
-        """Updates the executed and skipped ticks of the sites (arm controllers) from an event.
+        """Updates the executed and skipped ticks of the sites from an event.
 
-        These kinds of events state something about ticks, the periods of the control loop:
+        The following kinds of events state something about ticks:
 
         - "end": number of ticks that the sender executed until it ended. A number beyond the
           duration of the scenario is reduced to that duration, because the site has certainly
           ended.
-        - "join": first tick of the sender when it joins the running session. An impossible tick
-          is ignored, because it would leave a gap up to that tick.
+        - "join": first tick of a sender that joins the running session. An impossible tick is
+          ignored, because it would leave a gap up to that tick.
         - `_OVERRUN`: ticks that the sender skipped because it was late.
         - `LAST`: number of ticks of another site that the sender received before that site was
-          started again.
+          restarted.
 
-        Other events are ignored, and so are events of members (processes of a session) that are
-        not sites.
+        Other events are ignored, as are events of members that are not sites.
 
         Args:
             event: The event.
@@ -205,9 +201,8 @@ class SessionAccounts:
     def _apply_join(self, event: Event) -> None:
         """Handles the event "join" of a site that joins the running session at a stated tick.
 
-        The site (arm controller) published no messages for the ticks (periods of the control
-        loop) before that tick, at least since its previous start ended. These messages must not
-        count as missing.
+        The site published no messages for the ticks before that, at least since its previous
+        start ended. These messages must not count as missing.
         """
         site = event.member
         published_ticks = self._end_ticks.pop(site, 0)
@@ -219,15 +214,14 @@ class SessionAccounts:
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
-        """Notes that a site skipped ticks (control periods), so no record of them is missing.
+        """Handles the event of a site that skipped ticks, whose records are then not missing.
 
-        The site reports this in an event, because its computer was too slow.
+        The site reports this because its computer was too slow.
 
         Args:
-            event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks
-                (control periods) in the form "first-last", and its ticks are the number of
-                ticks that have passed. Ranges that are not below this number are not valid, and
-                are ignored.
+            event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks in
+                the form "first-last", and its ticks are the number of ticks that have passed.
+                Ranges that are not below this number are invalid, and are ignored.
         """
         # The number of a tick has at most 12 digits.
         ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
@@ -242,7 +236,7 @@ class SessionAccounts:
     def _apply_last(self, event: Event) -> None:
         """Handles the event that states how many ticks of a peer's earlier start arrived.
 
-        It gives a lower limit of the number of messages that the peer published before it was
+        This is a lower bound on the number of messages that the peer published before it was
         killed, which shows whether missing messages were lost or never sent.
         """
         site = event.about
@@ -252,13 +246,13 @@ class SessionAccounts:
             gap.note_published(number - base)
 
     def mark_skipped_ticks(self, site: str, tick: int, skipped: int) -> None:
-        """Counts the messages of skipped ticks as unpublished, so that they are not missing.
+        """Counts the messages of skipped ticks as unpublished rather than missing.
 
-        A tick is one period of the control loop. A site that is late skips ticks. It does not
-        execute the skipped ticks, and publishes no messages for them.
+        A site that is late skips ticks. It does not execute them, and publishes no messages for
+        them.
 
         Args:
-            site: Name of the site, the process that runs one arm.
+            site: Name of the site.
             tick: First tick after the skipped ticks.
             skipped: Number of skipped ticks.
         """
@@ -273,19 +267,18 @@ class SessionAccounts:
             account.mark_unpublished(first - first_number, published - first_number)
 
     def count_message(self, topic: str, number: int, account: Account | None = None) -> bool:
-        """Counts a message as received, by its number in its channel.
+        """Counts a message as received, given its number in its channel.
 
-        If the log is divided into several files, a later file is counted from its first message
-        on. Messages with lower numbers than that message are ignored.
+        If the log is divided into several files, the counts for a later file begin at its first
+        message, and messages with lower numbers are ignored.
 
         Args:
             topic: Topic of the message.
             number: Number of the message in its channel.
-            account: Object that counts the message. If None, the object that counts the
-                messages of the topic is used.
+            account: Account in which to count the message. If None, the account of the topic.
 
         Returns:
-            False if a message with this number had been received before. True otherwise, even
+            False if a message with this number had already been received. True otherwise, even
             for a message that is ignored.
         """
         first_number = self._bases.setdefault(topic, number if self._continued else 0)
@@ -297,9 +290,9 @@ class SessionAccounts:
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
         """Yields, for each numbered channel of a site, the gap in its numbers before a start.
 
-        While a site (arm controller) was away, it published nothing. The gap keeps these
-        numbers from counting as missing. It is created when it is first needed. The number of
-        gaps is limited, so that forged events with invented starts cannot fill the memory.
+        While a site was away, it published nothing. The gap prevents these numbers from
+        counting as missing, and is created when it is first needed. The number of gaps is
+        limited, so that forged events with invented starts cannot fill the memory.
 
         Args:
             site: Name of the site.
@@ -321,11 +314,11 @@ class SessionAccounts:
     def add_expected_ticks(self, site: str, ticks: int) -> None:
         """Updates the accounts for a site that executed at least a given number of ticks.
 
-        Records and statistics of these ticks (control periods) that have not been received
-        count as missing from now on.
+        Records and statistics of these ticks that have not been received count as missing from
+        now on.
 
         Args:
-            site: Name of the site (arm controller).
+            site: Name of the site.
             ticks: Number of executed ticks, counted from the start of the session.
         """
         for channel in (topics.STATE, topics.LINK):
@@ -333,7 +326,7 @@ class SessionAccounts:
             self._add_expected(site, channel, published)
 
     def _add_expected(self, member: str, channel: str, published: int) -> None:
-        """States that at least `published` messages of a channel exist."""
+        """Records that at least `published` messages of a channel exist."""
         topic = self._topic(member, channel)
         account = self._accounts.get(topic)
         if account is not None:
@@ -341,17 +334,16 @@ class SessionAccounts:
             account.add_expected(published - base)
 
     def format_accounts(self) -> dict[str, str]:
-        """Formats the numbers of received and missing messages, as they are stored in a log.
+        """Formats the numbers of received and missing messages for storage in a log.
 
-        A line is, for example, "expected 1000, received 998, missing 2, ...". If the log is a
-        later part of a recording, the messages are counted from the first one in this part. The
-        line then begins with the number of that message, such as "from 5000 on: ".
+        A typical line is "expected 1000, received 998, missing 2, ...". In a later part of a
+        recording, messages are counted from the first one in this part, and the line begins
+        with the number of that message, for example "from 5000 on: ".
 
         Returns:
-            A line of text for each topic, such as "/trilat/paper/m1/state", whose last two
-            parts are the member (process of a session) and the channel. A member that is not a
-            site (arm controller), such as a recorder, has no line if no message is expected
-            from it.
+            Maps each topic, such as "/trilat/paper/m1/state", to a line of text. The last two
+            components of a topic are the member and the channel. A member that is not a site,
+            such as a recorder, has no line if no message is expected from it.
         """
         texts = {}
         for topic, account in self._accounts.items():
@@ -372,13 +364,12 @@ class SessionAccounts:
     def list_starts(self, topic: str) -> list[Account]:
         """Lists the message counts of a topic, separately for each start of its sender.
 
-        An `Account` holds the numbers of received and missing messages. Events are numbered
-        from 0 again whenever their sender is started. Therefore each start has its own account.
-        All other messages continue their numbers. Therefore the topic of such messages has a
+        Events are numbered from 0 again whenever their sender is restarted, so there is one
+        `Account` per start. All other messages continue their numbers, so their topics have a
         single account.
 
         Args:
-            topic: Topic of the channel. It must be counted, see `open_channel`.
+            topic: Topic of the channel, for which `open_channel` must have been called.
         """
         return list(self._starts.get(topic, {}).values()) or [self._accounts[topic]]
 
@@ -386,13 +377,13 @@ class SessionAccounts:
         """Lists the ranges of missing numbers of a topic, over all starts of its sender.
 
         Events are numbered from 0 again at each start of their sender. Each start then has its
-        own account, and all accounts are considered.
+        own account, and all accounts are included.
 
         Args:
             topic: Topic of the channel.
 
         Returns:
-            The first and the last number of each range. Empty if no message is missing.
+            The first and last number of each range. Empty if no message is missing.
         """
         first_number = self._bases.get(topic, 0)
         gaps = []
@@ -403,13 +394,9 @@ class SessionAccounts:
         return gaps
 
     def coverage(self) -> Coverage:
-        """Computes how many ticks every site executed, and how many of them were recorded.
+        """Counts how many ticks each site executed, and how many of them were recorded.
 
-        If it is unknown when a site (arm controller) ended, all ticks (control periods) of the
-        scenario count as executed.
-
-        Returns:
-            Both numbers for every site.
+        If it is unknown when a site ended, all ticks of the scenario count as executed.
         """
         records = {}
         ticks = {}
@@ -424,12 +411,11 @@ class SessionAccounts:
         return Coverage(records, ticks)
 
     def describe_missing(self) -> Iterator[str]:
-        """Describes how many records are missing, with a line for each incomplete site.
+        """Describes how many records are missing, with one line per incomplete site.
 
         Yields:
-            A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks
-            (control periods).
-                Sites (arm controllers) without missing records have no line.
+            A line such as "m1: 3 of 5000 records: ...", with the first ranges of missing ticks.
+            Sites without missing records are left out.
         """
         for site in self._rates_hz:
             topic = self._topic(site, topics.STATE)
@@ -445,19 +431,19 @@ class SessionAccounts:
     def unknown_ends(self) -> list[str]:
         """Names of the sites whose end is unknown.
 
-        A site publishes an "end" event when it ends, which states how many ticks (periods of
-        the control loop) it executed. For these sites, no such event has been received.
+        A site publishes an "end" event when it ends, which states how many ticks it executed.
+        For the sites listed here, no such event has been received.
         """
         return [site for site in self._rates_hz if site not in self._end_ticks]
 
     def describe_unfinished_sites(self) -> Iterator[str]:
         """Describes for the user which sites may have executed more ticks than were recorded.
 
-        These are the sites (arm controllers) that never published the event "end", and whose
-        last recorded tick (control period) is not the last tick of the scenario.
+        These are the sites that never published the event "end", and whose last recorded tick
+        is not the last tick of the scenario.
 
         Yields:
-            A line for each of these sites.
+            One line per such site.
         """
         for site in self.unknown_ends:
             topic = self._topic(site, topics.STATE)
@@ -474,14 +460,16 @@ class SessionAccounts:
     def open(
         cls, metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
     ) -> "SessionAccounts | None":
-        """Prepares the counting of a session's messages, before a file of it is read.
+        """Prepares to count a session's messages, before a file of it is read.
 
         Args:
-            metadata: Metadata of the file, by name. They state the session.
-            attachments: Attachments of the file, by name. One of them is the scenario.
+            metadata: Maps the name of each metadata record of the file to its contents. They
+                identify the session.
+            attachments: Maps the name of each attachment of the file to its contents. One of
+                them is the scenario.
 
         Returns:
-            The object, which has counted no message yet. None if the file is not a log of
+            Accounts with no messages counted yet, or None if the file is not a log of
             trilat-net.
         """
         session_facts = metadata.get(SESSION, {})

@@ -1,13 +1,12 @@
-"""Checks a log: its bytes, its completeness, and its agreement with its scenario.
+"""Checks a log: its bytes, its completeness, and its consistency with its scenario.
 
-It implements `trilat log check`. The bytes of any MCAP file are checked. The content is checked
-only if the file is a log of trilat-net: each message is compared with the place in the file
-where it is stored, with the scenario (the description of the experiment), and with the earlier
-messages. The control laws are not executed again. That is the task of
-`trilat_net.execution.verification`.
+Implements `trilat log check`. The bytes of any MCAP file are checked, but the content only if
+the file is a log of trilat-net. Each message is then compared with its position in the file,
+with the scenario, and with the earlier messages. The control laws are not executed again. That
+is the task of `trilat_net.execution.verification`.
 
 Invariant:
-    - Each check produces one finding, with the places at which the check failed.
+    - Each check produces one finding, which lists the places where the check failed.
     - Missing messages are listed as ranges of their numbers.
 """
 
@@ -47,15 +46,17 @@ from .ros2 import cdr
 from .session_accounts import SessionAccounts
 
 _MAX_AHEAD_NS = 10 * NS_PER_S
-"""Largest time by which the sending may be later than the arrival, because of wrong clocks."""
+"""Maximum time by which sending may appear to be later than arrival because of clock errors, in
+ns.
+"""
 _MAX_BOOTS = 64
-"""Largest number of starts of a member whose messages are counted separately."""
+"""Maximum number of starts of a member whose messages are counted separately."""
 _CDR_HEAD = b"\x00\x01"
-"""First bytes of a message in plain CDR, the encoding of ROS 2, in little-endian order."""
+"""First bytes of a message in plain little-endian CDR, the encoding of ROS 2."""
 _RATE_TOLERANCE = 0.02
-"""Largest relative difference between a measured tick rate and that of the scenario."""
+"""Maximum relative difference between a measured tick rate and that of the scenario."""
 _RATE_SPAN_NS = 2 * NS_PER_S
-"""Shortest time over which a tick rate is measured, in ns."""
+"""Minimum time over which a tick rate is measured, in ns."""
 _ACCOUNTS_SINCE = 3
 """First schema version whose logs state the message counts of every channel."""
 
@@ -64,7 +65,7 @@ _ACCOUNTS_SINCE = 3
 class LogCheckResult(CheckReport):
     """Result of checking the files of one log for damage and missing messages.
 
-    `trilat log check` prints it.
+    Printed by `trilat log check`.
 
     Attributes:
         files: Names of the files.
@@ -109,12 +110,11 @@ class LogCheckResult(CheckReport):
         ]
 
     def check_signatures(self, key_file: Path, progress: Progress | None = None) -> None:
-        """Checks the signatures of the files as well, and adds the result to the findings.
+        """Checks the signatures of the files too, and adds the result to the findings.
 
         Args:
-            key_file: File of the public key of a signer whom the user trusts.
-            progress: Function that is called after every record (result of a control period) of
-                a log.
+            key_file: Path of the public key file of a signer whom the user trusts.
+            progress: Function that is called after every record of a log.
 
         Raises:
             LogError: A log cannot be read.
@@ -126,7 +126,7 @@ class LogCheckResult(CheckReport):
 
 
 def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheckResult:
-    """Checks that a log is well-formed, complete and consistent, as `trilat log check` does.
+    """Checks that a log is well-formed, complete and consistent, like `trilat log check`.
 
     Every byte of the file, or of all parts of the log, is checked.
 
@@ -135,8 +135,8 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     True
 
     Args:
-        files: The file, or the parts of the log.
-        progress: Function that is called repeatedly with the number of bytes read and their
+        files: Path of the file, or paths of the parts of the log.
+        progress: Function that is called repeatedly with the number of bytes read and the
             total.
 
     Raises:
@@ -164,19 +164,19 @@ class _ChannelCheck:
     """Checks the messages of one channel of a session: their numbers, schema and time stamps.
 
     Args:
-        key: Names of the session, of the member and of the channel. A member is a site, which
-            runs one arm, or the recorder.
+        key: Names of the session, of the member and of the channel. The member is a site or the
+            recorder.
         about: Metadata of the session.
         scenario: Scenario of the session. None if it cannot be read.
-        findings: Results of the checks, to which the problems are added.
+        findings: Results of the checks, to which problems are added.
         accounts: Counts of received and missing messages of the session, to which the messages
             are added.
 
     Attributes:
         member: Name of the member.
         kind: Name of the channel: "state" (records), "link" (statistics), "event" or "stats".
-        rate_hz: Tick rate of the site, in Hz. It is 0 for the recorder.
-        received: Number of messages, without repetitions.
+        rate_hz: Tick rate of the site, in Hz; 0 for the recorder.
+        received: Number of messages, not counting duplicates.
         boots: Random numbers that identify the starts of the member's process.
         first: Number and sending time of the message with the lowest number. None if there is
             no message.
@@ -220,9 +220,9 @@ class _ChannelCheck:
 
     @property
     def name(self) -> str:
-        """Short name of the channel for texts, such as "m1/state".
+        """Short name of the channel for messages to the user, such as "m1/state".
 
-        It consists of the publishing member ("m1") and the kind of message ("state").
+        Consists of the publishing member ("m1") and the kind of message ("state").
         """
         return f"{self.member}/{self.kind}"
 
@@ -230,8 +230,8 @@ class _ChannelCheck:
         """Starts the check of the channel in the next file of the log.
 
         A log may be divided into several files. The description of the channel in the file
-        (schema, encoding and metadata) is checked at once. The messages of the file are passed
-        to `check_message` afterwards.
+        (schema, encoding and metadata) is checked immediately. The messages of the file are
+        passed to `check_message` afterwards.
 
         Args:
             file: Name of the file.
@@ -245,11 +245,11 @@ class _ChannelCheck:
             self._add("schema", None, fault)
 
     def _find_schema_fault(self, channel: ChannelInfo) -> str:
-        """Returns the first fault in a file's description of the channel, as text.
+        """Returns a description of the first fault in a file's description of the channel.
 
-        The description must name the schema (the fields of the messages) that this version of
-        the log uses, its encoding, and the tick rate of the site (arm controller). The text is
-        empty if there is no fault.
+        The description of the channel must state the schema (the fields of the messages) used
+        by this version of the log, its encoding, and the tick rate of the site. Empty if there
+        is no fault.
         """
         kind = CHANNEL_TYPES[self.kind]
         if not channel.schema:
@@ -272,11 +272,10 @@ class _ChannelCheck:
         return ""
 
     def check_message(self, stored: McapMessage, offset: int) -> None:
-        """Checks one message: that it can be decoded, is in its place, and has a possible time.
+        """Checks that a message can be decoded, is in its place, and has a plausible time.
 
-        A message states its sender, its number and its sending time. They must agree with the
-        sender, number and time that the file states for the message. Problems are added to the
-        findings.
+        The sender, number and sending time in the message must match those that the file states
+        for it. Problems are added to the findings.
 
         Args:
             stored: The message, with its times and its sequence number in the file.
@@ -330,7 +329,7 @@ class _ChannelCheck:
         Args:
             message: The message.
             number: Number of the message in its channel.
-            publish_ns: Sending time of the message, in Unix time, in ns.
+            publish_ns: Sending time of the message in Unix time, in ns.
             offset: Offset of the message in the file.
         """
         if message.boot not in self.boots and len(self.boots) >= _MAX_BOOTS:
@@ -363,16 +362,16 @@ class _ChannelCheck:
     def _check_times(
         self, stored: McapMessage, number: int, stated_ns: int | None, offset: int
     ) -> None:
-        """Checks the arrival time and the sending time that the file states for a message.
+        """Checks the arrival and sending times that the file states for a message.
 
         Arrival times must not decrease. The sending time must be that of the message itself,
         and not later than the arrival by more than the clocks can differ.
 
         Args:
             stored: The message, with its times in the file.
-            number: Number of the message, for the texts.
-            stated_ns: Sending time that the message states, in ns after the start of the
-                session. None if it states no time.
+            number: Number of the message, for the error messages.
+            stated_ns: Sending time stated by the message, in ns after the start of the session.
+                None if it states no time.
             offset: Offset of the message in the file.
         """
         log_ns = stored.log_time_ns
@@ -398,7 +397,7 @@ class _ChannelCheck:
 
 
 def _read_checked(reader: McapReader, structure: FileCheck) -> Iterator[McapMessage]:
-    """Yields the messages of a file, after a check of the record that contains them.
+    """Yields the messages of a file, after checking the record that contains them.
 
     Args:
         reader: Reader of the file.
@@ -411,7 +410,7 @@ def _read_checked(reader: McapReader, structure: FileCheck) -> Iterator[McapMess
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
-    """Returns a number from the metadata, or 0 if the entry is missing or not a number."""
+    """Returns an integer from the metadata, or 0 if the entry is missing or not an integer."""
     text = about.get(key, "")
     return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
 
@@ -419,12 +418,12 @@ def _parse_number(about: Mapping[str, str], key: str) -> int:
 class _SessionCheck:
     """Checks one session, whose log is one file or several parts.
 
-    The caller passes the files to `read`, one after another, and then gets the results from
+    The caller passes the files to `read`, one after another, and then obtains the results from
     `findings`.
 
     Attributes:
         ours: True if a file is a log of trilat-net, False for any other MCAP file.
-        channels: The check of each channel, by topic.
+        channels: Maps each topic to the check of its channel.
     """
 
     def __init__(self) -> None:
@@ -456,13 +455,13 @@ class _SessionCheck:
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
         """Checks every byte of one file of the log, and its messages.
 
-        The problems are collected, and `findings` returns them after the last file.
+        Problems are collected, and returned by `findings` after the last file.
 
         Args:
             file: Name of the file.
             stream: The file, opened for reading.
-            progress: Function that is called repeatedly with the number of bytes read and
-                their total.
+            progress: Function that is called repeatedly with the number of bytes read and the
+                total.
 
         Raises:
             LogError: The file belongs to another session than the previous files.
@@ -475,7 +474,7 @@ class _SessionCheck:
         self._counts += structure.counts
 
     def _read_messages(self, file: str, reader: McapReader, structure: FileCheck) -> None:
-        """Checks all messages of a file, and compares them with the hashes in the file.
+        """Checks all messages of a file, and compares them with the digests in the file.
 
         Args:
             file: Name of the file.
@@ -519,15 +518,15 @@ class _SessionCheck:
             self._findings["chain"].add(file, None, self._chain_text)
 
     def _begin_file(self, reader: McapReader) -> None:
-        """Prepares the check of a file, once its metadata and its scenario were read.
+        """Prepares the check of a file, once its metadata and its scenario have been read.
 
-        The files of a log must belong to one session, which is checked by its metadata. The
-        files, and those that are parts of a log, are counted, because a recorder can divide a
-        log into several files. The scenario, the description of the experiment, is also
-        checked. For the first file, the counts of the messages are prepared.
+        The metadata must show that the files of a log belong to one session. The files, and
+        those that are parts of a log, are counted, because a recorder can divide a log into
+        several files. The scenario is checked too. For the first file, the counts of the
+        messages are prepared.
 
-        Nothing happens if neither this file nor an earlier one is a log of trilat-net. `ours`
-        remains False in this case.
+        Does nothing if neither this file nor an earlier one is a log of trilat-net, in which
+        case `ours` remains False.
 
         Args:
             reader: Reader of the file.
@@ -572,7 +571,7 @@ class _SessionCheck:
             self._open_accounts(about["session"])
 
     def _open_accounts(self, session: str) -> None:
-        """Prepares the counting of the messages that the sites of the session have published.
+        """Prepares to count the messages published by the sites of the session.
 
         This happens before the first record is read, because an event or statistics may state
         how many records there must be, even if the file contains none.
@@ -587,11 +586,10 @@ class _SessionCheck:
     def _check_scenario(self, text: bytes) -> None:
         """Checks the scenario in the log, and compares it with the metadata of the session.
 
-        The scenario is the description of the experiment. The metadata contain its SHA-256, its
-        name, its seed and its sites (arm controllers).
+        The metadata contain the SHA-256 hash of the scenario, its name, its seed and its sites.
 
         Args:
-            text: Text of the scenario, encoded.
+            text: Encoded text of the scenario.
         """
         finding = self._findings["scenario"]
         metadata = self._about
@@ -625,15 +623,15 @@ class _SessionCheck:
                 )
 
     def _begin_channel(self, channel: ChannelInfo) -> _ChannelCheck | None:
-        """Begins the check of a channel in the present file, when its first message is read.
+        """Begins the check of a channel in the current file, when its first message is read.
 
-        The description of the channel (its schema, encoding and metadata) is checked at once,
-        and problems are added to the finding "schema". There are three kinds of channels:
-        channels for viewers, channels of the session's members, and channels of other programs.
-        Messages are compared with the session only for the members' channels.
+        The description of the channel (its schema, encoding and metadata) is checked
+        immediately, and problems are added to the finding "schema". There are three kinds of
+        channels: channels for viewers, channels of the session's members, and channels of other
+        programs. Messages are compared with the session only for the members' channels.
 
         Args:
-            channel: Description of the channel in the present file.
+            channel: Description of the channel in the current file.
 
         Returns:
             The check of the messages, which is continued from the previous file of the log.
@@ -677,7 +675,7 @@ class _SessionCheck:
         return self.channels[topic]
 
     def _check_view_channel(self, channel: ChannelInfo) -> None:
-        """Checks that a channel for viewers has a standard message type of ROS 2, in CDR."""
+        """Checks that a channel for viewers has a standard ROS 2 type, encoded in CDR."""
         encodings = (channel.encoding, channel.schema_encoding)
         is_cdr = encodings == (cdr.ENCODING, cdr.SCHEMA_ENCODING)
         if not is_cdr or channel.schema_data != cdr.ROS2_SCHEMAS.get(channel.schema):
@@ -686,11 +684,11 @@ class _SessionCheck:
             self._findings["schema"].add(self._file, None, text)
 
     def findings(self) -> Iterator[Finding]:
-        """Completes all checks after the files were read, and yields their results.
+        """Completes all checks after the files have been read, and yields their results.
 
         If the files contain no session of trilat-net, only the checks of the file format are
-        yielded. If checksums show that the session was removed from the file, the result
-        "chain" is also yielded.
+        yielded, plus the result "chain" if checksums show that the session was removed from the
+        file.
         """
         counts = self._counts
         findings = self._findings
@@ -722,7 +720,7 @@ class _SessionCheck:
         yield findings["scenario"].conclude(text)
 
     def _check_sequence(self) -> Finding:
-        """Returns the finding about missing and repeated messages, which their numbers reveal.
+        """Returns the finding about missing and repeated messages, based on their numbers.
 
         The recorder's statistics are not counted, because they are not numbered.
         """
@@ -761,10 +759,10 @@ class _SessionCheck:
 
     @property
     def _needs_end_events(self) -> bool:
-        """True if the checked files must contain the last event of every arm controller (site).
+        """True if the checked files must contain the "end" event of every site.
 
-        A site publishes the event "end" at its end. It may be missing if only one of several
-        parts of a log is checked, or if the recorder was told not to record events.
+        The event may be missing if only one of several parts of a log is checked, or if the
+        recorder was configured not to record events.
         """
         session = self._about["session"]
         channel_filter = ChannelFilter.parse_facts(self._about)
@@ -775,17 +773,16 @@ class _SessionCheck:
         return are_events_recorded and not is_single_part
 
     def _check_accounts(self) -> Finding:
-        """Compares the accounts, the recorder's counts of messages, with the messages.
+        """Compares the accounts, the recorder's message counts, with the messages.
 
         At the end of a file, the recorder states for each channel how many messages it received
-        and how many are missing. The comparison is not possible if these counts include
-        messages of parts that were not read, or if several recorders wrote the log. The
-        recorder's own statistics have no numbers. Therefore the counts of statistics cannot be
-        compared. Since version `_ACCOUNTS_SINCE` of the schema, every channel must have an
-        account.
+        and how many are missing. The comparison is impossible if these counts include messages
+        of parts that were not read, or if several recorders wrote the log. The recorder's own
+        statistics are not numbered, so their counts cannot be compared. Since version
+        `_ACCOUNTS_SINCE` of the schema, every channel must have an account.
 
         Returns:
-            The finding, with a problem for each channel whose account is wrong or missing.
+            A finding with one problem for each channel whose account is wrong or missing.
         """
         finding = self._findings["accounts"]
         if not self._accounts:
@@ -816,13 +813,13 @@ class _SessionCheck:
     def _check_rates(self) -> Finding:
         """Compares the rates at which the sites sent records with the rates of the scenario.
 
-        The number of a record is its tick (control period). The mean rate is therefore the
-        difference between the numbers of the first and the last record, divided by the time
-        between them. It may deviate by the fraction `_RATE_TOLERANCE`. Records over less than
-        `_RATE_SPAN_NS` are not judged.
+        The number of a record is its tick. The mean rate is therefore the difference between
+        the numbers of the first and the last record, divided by the time between them. It may
+        deviate by the fraction `_RATE_TOLERANCE`. Records spanning less than `_RATE_SPAN_NS`
+        are not judged.
 
         Returns:
-            The finding, with a problem for each site (arm controller) whose rate is wrong.
+            A finding with one problem for each site whose rate is wrong.
         """
         finding = self._findings["rates"]
         texts = []

@@ -1,14 +1,14 @@
-"""Gives access to the recorded states of one arm, as arrays over time or one by one.
+"""Provides the recorded states of one arm, as arrays over time or as single records.
 
-An arm publishes a record of its state in every period of its control loop, and a log stores the
-records as encoded bytes. This module decodes the fields of all records into arrays (`SiteLog.q`
-has the joint angles), or whole records into objects (`SiteLog.states`).
+An arm publishes a record of its state in every tick, and a log stores the records as encoded
+bytes. This module decodes fields of all records into arrays (`SiteLog.q` contains the joint
+angles), or complete records into objects (`SiteLog.states`).
 
 Invariant:
     - Only the requested fields and records are decoded.
     - An invalid record raises an error that names the arm.
-    - The memory for whole records is bounded, however long the log is: long sequences of
-      records are decoded in blocks when they are accessed.
+    - Memory for complete records is bounded, however long the log is: long sequences of records
+      are decoded in blocks when they are accessed.
 """
 
 import math
@@ -38,26 +38,28 @@ M = TypeVar("M")
 T = TypeVar("T")
 
 MAX_DECODED_RECORDS = 1 << 16
-"""Largest number of decoded records of a site: a minute at 1 kHz, some 150 MB."""
+"""Maximum number of decoded records of a site: one minute at 1 kHz, about 150 MB."""
 BLOCK_RECORDS = 1 << 11
-"""Number of records that are decoded together."""
+"""Number of records decoded together."""
 HEAVY_BYTES = 12 << 20
 _HEAVY_RATIO = 10
 """The records of a site are heavy if their decoded form is larger than `HEAVY_BYTES`, and also
-larger than `_HEAVY_RATIO` times their encoded form. Only few heavy records are kept decoded,
-because a malicious file could otherwise fill the memory.
+larger than `_HEAVY_RATIO` times their encoded form. Only a few heavy records are cached in
+decoded form, because a malicious file could otherwise fill the memory.
 """
 _HEAVY_BLOCK = 128
-"""Number of heavy records that are decoded together."""
+"""Number of heavy records decoded together."""
 _HEAVY_BLOCKS = 8
-"""Number of blocks of heavy records that are kept decoded."""
+"""Number of blocks of heavy records cached in decoded form."""
 
 DecodeStates = Callable[[Sequence[bytes]], list[State]]
-"""Function that decodes some records. It raises an error if a payload is not a valid record."""
+"""Function that decodes several records, and raises an error if a payload is not a valid
+record.
+"""
 
 
 def freeze(value: T) -> T:
-    """Makes an array read-only, so that a user of a log cannot change its values by accident.
+    """Makes arrays read-only, so that users of a log cannot change its values by accident.
 
     Args:
         value: An array, or a tuple or dictionary of arrays, all of which are made read-only.
@@ -79,15 +81,15 @@ def freeze(value: T) -> T:
 def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     """Computes the differences between the poses of an end effector and their references.
 
-    The error of a position is x - x_des. The error of an orientation is the rotation vector
-    (axis times angle) of the shortest rotation from the reference to the orientation.
+    The position error is x - x_des. The orientation error is the rotation vector (axis times
+    angle) of the shortest rotation from the reference to the orientation.
 
     Args:
         x: Positions x, y, z in m, or poses, which are positions and rotation vectors in rad,
-            shape (K, m), for K records (results of control periods).
+            shape (K, m), for K records.
         x_des: Their references, in the same format, shape (K, m).
-        axes: For each of the m coordinates, 1 if the site (arm controller) follows its
-            reference along that axis. For the other axes it is 0, and the error is set to 0.
+        axes: One entry per coordinate: 1 if the site follows its reference along that axis, or
+            0 if not, in which case the error is set to 0.
 
     Returns:
         The errors, shape (K, m), in m and rad.
@@ -101,16 +103,15 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 
 class LazyRecords(Sequence[State]):
-    """Sequence of the records of a site, which are decoded only when they are accessed.
+    """Sequence of the records of a site, decoded only when they are accessed.
 
-    A record is the result of one tick of the control loop. The records are decoded in blocks,
-    and the blocks that were accessed last are kept in memory. Thus a log of any length can be
-    read with little memory.
+    The records are decoded in blocks, and the most recently used blocks are cached. A log of
+    any length can therefore be read with little memory.
 
     Args:
         payloads: The encoded records.
         decode_block: Function that decodes several encoded records.
-        heavy: True if the decoded records are so large that only few of them are kept, see
+        heavy: True if the decoded records are so large that only a few of them are cached, see
             `HEAVY_BYTES`.
     """
 
@@ -125,7 +126,7 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=block_count)
         def get_block(number: int) -> list[State]:
-            """Returns a block of consecutive records. It is decoded if it is not in memory.
+            """Returns a block of consecutive records, decoding it if it is not cached.
 
             Args:
                 number: Number of the block, counted from 0.
@@ -160,15 +161,15 @@ class LazyRecords(Sequence[State]):
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
-    """Decodes the records of a site (arm controller), at once or when they are accessed.
+    """Decodes the records of a site, either immediately or when they are accessed.
 
-    A list is faster to use, but keeps all decoded records (results of control periods) in
-    memory. Therefore records are decoded at once only if there are at most
-    `MAX_DECODED_RECORDS` of them, and if they are not heavy (see `HEAVY_BYTES`).
+    A list is faster to use, but keeps all decoded records in memory. Records are therefore
+    decoded immediately only if there are at most `MAX_DECODED_RECORDS` of them, and if they are
+    not heavy (see `HEAVY_BYTES`).
 
     Args:
         payloads: The encoded records.
-        decode_block: Function that decodes some of them.
+        decode_block: Function that decodes a block of them.
 
     Returns:
         The records in the order of `payloads`: a list, or a sequence that decodes on access.
@@ -189,22 +190,22 @@ def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Seq
 
 
 def _estimate_bytes(state: State) -> int:
-    """Estimates the memory that a decoded record takes, in bytes.
+    """Estimates the memory that a decoded record needs, in bytes.
 
-    Each entry of `rx`, `echo` and `cmd` is a separate Python object, and takes much memory.
+    Each entry of `rx`, `echo` and `cmd` is a separate Python object, and needs much memory.
     """
     entries = len(state.rx) + len(state.echo) + len(state.cmd)
     return 2_000 + 130 * entries + 100 * len(state.used) + 32 * len(state.mem)
 
 
 class RecordsByTick(Mapping[int, State]):
-    """Read-only mapping from ticks (control periods) to the records of a site (arm controller).
+    """Read-only mapping from ticks to the records of a site.
 
-    It is used for long logs, because a record is decoded only when it is accessed. If several
-    records have the same tick, the mapping contains the last of them.
+    Used for long logs, because a record is decoded only when it is accessed. If several records
+    have the same tick, the mapping contains the last of them.
 
     Args:
-        states: The K records, in the order of their ticks.
+        states: The K records, in tick order.
         ticks: The tick of each record, shape (K,).
     """
 
@@ -214,7 +215,7 @@ class RecordsByTick(Mapping[int, State]):
 
     @cached_property
     def _ticks(self) -> list[int]:
-        """The ticks as a list, in which a search takes less time than in an array."""
+        """The ticks as a list, which is faster to search than an array."""
         ticks: list[int] = self._array.tolist()
         return ticks
 
@@ -232,12 +233,12 @@ class RecordsByTick(Mapping[int, State]):
 
 
 class TimedMessages(NamedTuple, Generic[M]):
-    """Messages of a log with the times at which they were sent and at which they arrived.
+    """Messages of a log with their sending and arrival times.
 
     Attributes:
         messages: The K messages.
-        log_ns: Times of arrival at the recorder, in Unix time, shape (K,), in ns.
-        publish_ns: Times of sending, in Unix time, shape (K,), in ns.
+        log_ns: Arrival times at the recorder in Unix time, shape (K,), in ns.
+        publish_ns: Sending times in Unix time, shape (K,), in ns.
     """
 
     messages: list[M]
@@ -246,14 +247,14 @@ class TimedMessages(NamedTuple, Generic[M]):
 
 
 class _RecordField(cached_property[T]):
-    """Property of `SiteLog` with one field of all records as an array.
+    """Property of `SiteLog` that provides one field of all records as an array.
 
-    The field is decoded when the property is accessed for the first time. The name of the
-    property is the name of the field.
+    The field is decoded when the property is first accessed. The name of the property is the
+    name of the field.
 
     Args:
-        read_column: Function that returns the field of all records (results of control
-            periods), by its name.
+        read_column: Function that takes a `SiteLog` and the name of the field, and returns its
+            values in all records.
         meaning: Docstring of the property.
     """
 
@@ -263,7 +264,9 @@ class _RecordField(cached_property[T]):
 
 
 class _RecordVector(cached_property[Array]):
-    """Property of `SiteLog` with one vector of all records as an array, see `_RecordField`.
+    """Property of `SiteLog` that provides one vector of all records as an array.
+
+    See `_RecordField`.
 
     Args:
         meaning: Docstring of the property.
@@ -289,38 +292,36 @@ def _read_objects(site: "SiteLog", field: str) -> NDArray[np.object_]:
 
 
 class SiteLog:
-    """Records of one site, in the order of their ticks (control periods).
+    """Records of one site, in tick order.
 
-    `Log` creates this object for each site of a log. K is the number of records (results of
-    control periods) below, n the number of joints, m the number of coordinates that the sites
-    share (the joints, or the coordinates of the end effector in task space), and P the number
-    of parameters.
+    `Log` creates one such object per site. In the following, K is the number of records, n the
+    number of joints, m the number of coordinates that the sites share (the joints, or the
+    coordinates of the end effector in task space), and P the number of parameters.
 
     Args:
         name: Name of the site.
-        peers: Names of its peers, the sites whose samples it receives, in scenario order.
+        peers: Names of the peers from which the site receives samples, in scenario order.
         rate_hz: Tick rate of the site, in Hz.
         payloads: The encoded records, as published, in any order.
         source: Name of the file for error messages.
-        times: Times of arrival and of sending of each record, in Unix time, shape (K,) each, in
-            ns. If None, all times are 0.
+        times: Arrival and sending times of the records in Unix time, each of shape (K,), in ns.
+            If None, all times are 0.
         layout: Lengths of the vectors of a record: n, m and P.
-        channel: Names and lengths of the numbers that the site's control law sends to its
+        channel: Names and lengths of the vectors that the site's control law sends to its
             peers.
         axes: In task space, 1 for each coordinate that the site follows, and 0 for the others.
 
     Attributes:
-        payloads: The encoded records, in the order of their ticks.
-        indexed: The records, if all of them have the exact layout that this program writes.
-            Their fields are then read by compiled code.
+        payloads: The encoded records, in tick order.
+        indexed: The records in a form whose fields compiled code can read, if all of them have
+            the exact layout that this program writes.
         tick: Tick of each record, shape (K,).
-        log_time_ns: Time of arrival of each record at the recorder, in Unix time, shape (K,),
-            in ns.
-        publish_time_ns: Time of sending of each record, as the record states it, in Unix time,
-            shape (K,), in ns.
+        log_time_ns: Arrival time of each record at the recorder in Unix time, shape (K,), in
+            ns.
+        publish_time_ns: Sending time stated by each record in Unix time, shape (K,), in ns.
 
     Raises:
-        LogError: A record cannot be read. The properties raise it as well, for the fields that
+        LogError: A record cannot be read. Also raised by the properties, for the fields that
             they decode.
     """
 
@@ -336,7 +337,7 @@ class SiteLog:
         channel: LawChannel = LawChannel(),  # noqa: B008
         axes: tuple[float, ...] = (),
     ) -> None:
-        """Finds the control period (tick) of each encoded record, and sorts the records."""
+        """Finds the tick of each encoded record, and sorts the records."""
         self.channel = channel
         self.name = name
         self.peers = peers
@@ -385,10 +386,10 @@ class SiteLog:
         return str(find_hook("render a site's records as HTML")(self))
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
-        """Decodes some quantities of all records into arrays that cannot be changed.
+        """Decodes quantities of all records into read-only arrays.
 
         Args:
-            decode_column: Method of `RecordColumns`, or a function of its object.
+            decode_column: Method of `RecordColumns`, or a function that takes such an object.
             *arguments: Further arguments of that method.
 
         Raises:
@@ -399,11 +400,11 @@ class SiteLog:
     def _read_from(
         self, payloads: Sequence[bytes], decode_column: Callable[..., T], *arguments: Any
     ) -> T:
-        """Decodes a field of some records into an array that cannot be changed.
+        """Decodes a field of the given records into a read-only array.
 
         Args:
-            payloads: The encoded records (results of control periods).
-            decode_column: Method of `RecordColumns`, or a function of its object.
+            payloads: The encoded records.
+            decode_column: Method of `RecordColumns`, or a function that takes such an object.
             *arguments: Further arguments of that method, such as the name of the field.
 
         Raises:
@@ -430,7 +431,7 @@ class SiteLog:
             self.__dict__.update(self._read_vectors(*missing))
 
     def _read_vectors(self, *fields: str) -> dict[str, Array]:
-        """Returns vectors of all records by name, each of shape (K, length)."""
+        """Maps the name of each vector to its values in all records, shape (K, length)."""
         if self.indexed is not None:
             return freeze(self.indexed.vectors(fields))
         return self._read(RecordColumns.vectors, self.layout, *fields)
@@ -442,26 +443,25 @@ class SiteLog:
             field: Name of the field in a record, see `State`.
 
         Returns:
-            The value in each record, shape (K,), in the order of the ticks.
+            The value in each record, shape (K,), in tick order.
         """
         return _read_ints(self, field)
 
     def memory(self, first: int, count: int) -> Array:
-        """Returns a part of the internal state of the site's control law in all records.
+        """Returns a part of the control law's internal state in all records.
 
-        The field `mem` of a record contains every number that the site (arm controller) and its
-        control law need to continue from this tick (control period), and that no other field
-        contains. The numbers have no names.
+        The field `mem` of a record contains all numbers that the site and its control law need
+        to continue from this tick and that are in no other field. The numbers have no names.
 
         Args:
-            first: Index of the first wanted number in `mem`.
-            count: Number of wanted numbers.
+            first: Index in `mem` of the first number to return.
+            count: Number of entries to return.
 
         Returns:
-            The numbers, shape (K, count).
+            The selected entries, shape (K, count).
 
         Raises:
-            LogError: The field of a record contains too few numbers.
+            LogError: `mem` has too few entries in a record.
         """
         wanted_numbers = [row[first : first + count] for row in self.mem]
         try:
@@ -474,10 +474,10 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Decodes a single record of an arm without all others, which is fast for a long log.
+        """Decodes a single record of an arm without the others, which is fast for a long log.
 
         Args:
-            n: Index of the record in the order of ticks. -1 is the last record.
+            n: Index of the record in tick order. -1 is the last record.
 
         Returns:
             The record.
@@ -485,10 +485,10 @@ class SiteLog:
         return self.decode([self.payloads[n]])[0]
 
     def decode(self, payloads: Sequence[bytes]) -> list[State]:
-        """Decodes whole records, and checks that their vectors have the lengths of this arm.
+        """Decodes complete records, and checks that the vector lengths match those of this arm.
 
         Args:
-            payloads: Encoded records (results of control periods) of the site (arm controller).
+            payloads: Encoded records of the site.
 
         Raises:
             LogError: A record cannot be decoded.
@@ -501,19 +501,19 @@ class SiteLog:
 
     @cached_property
     def states(self) -> Sequence[State]:
-        """The whole records in the order of their ticks, decoded and checked.
+        """The complete records in tick order, decoded and checked.
 
-        If there are many records, a record is decoded only when it is accessed. To compute with
-        a single quantity, the arrays such as `q` are much faster.
+        If there are many records, a record is decoded only when it is accessed. For
+        computations on a single quantity, arrays such as `q` are much faster.
         """
         return decode_records(self.payloads, self.decode)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """All records by the number of their control period (tick).
+        """Mapping from ticks to records.
 
-        Two logs are compared this way, because either may lack records. If several records have
-        the same tick, the last one counts.
+        Used to compare two logs, because either may lack records. If several records have the
+        same tick, the last one counts.
         """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
@@ -521,7 +521,7 @@ class SiteLog:
 
     @property
     def last_tick(self) -> int:
-        """Number of the control period (tick) of the last record, or -1 without records.
+        """Tick of the last record, or -1 if there are no records.
 
         Ticks are counted from 0 at the start of the run.
         """
@@ -531,8 +531,8 @@ class SiteLog:
     def diverged_s(self) -> float | None:
         """Time at which the arm exceeded a safety limit, which ended the run, in s.
 
-        This is the time of the last record if its mode is "diverged". The value is None if the
-        arm stayed within its limits, or if there are no records.
+        This is the time of the last record if its mode is "diverged". None if the arm stayed
+        within its limits, or if there are no records.
         """
         if not len(self):
             return None
@@ -543,8 +543,8 @@ class SiteLog:
     def missing(self) -> int:
         """Number of ticks before the last record that have no record.
 
-        The network or a full queue lost these records, or the site skipped the ticks. Records
-        that are missing at the end cannot be counted here.
+        These records were lost in the network or because a queue was full, or the site skipped
+        the ticks. Records missing after the last one cannot be counted here.
         """
         if not len(self):
             return 0
@@ -555,7 +555,7 @@ class SiteLog:
 
     @property
     def skipped(self) -> int:
-        """Number of ticks that the site skipped because it was late, as its records state.
+        """Number of ticks that the site skipped because it was late, according to its records.
 
         Only a site with an external arm skips ticks, because a real arm cannot catch up.
         """
@@ -563,7 +563,7 @@ class SiteLog:
 
     @property
     def skipped_ranges(self) -> list[tuple[int, int]]:
-        """Ranges of skipped ticks, as (first tick, last tick), in ascending order.
+        """Ranges (first tick, last tick) of skipped ticks, in ascending order.
 
         The record after a range states how many ticks the site skipped before it.
         """
@@ -587,37 +587,37 @@ class SiteLog:
     qd_des = _RecordVector("Derivative of the reference, shape (K, m), rad/s.")
     tau = _RecordVector("Control torque of Eq. (13), shape (K, n), N m.")
     tau_x = _RecordVector(
-        "Exogenous torque in the sign of Eq. (8), shape (K, n), N m. The torque on the arm is "
-        "its negative.",
+        "Exogenous torque with the sign of Eq. (8), shape (K, n), N m. The torque on the arm "
+        "is its negative.",
     )
     theta_hat = _RecordVector(
         "Estimate of the arm's dynamic parameters, Eq. (15), shape (K, P). Those of a two-link "
         "arm are defined in Eq. (24)."
     )
     x = _RecordVector(
-        "In task space, the position and the rotation vector of the end effector as recorded, "
-        "shape (K, m), m and rad. "
-        "The vector jumps where it passes half a turn. `orientation` does not jump."
+        "In task space, the recorded position and rotation vector of the end effector, shape "
+        "(K, m), m and rad. The vector jumps where it passes half a turn. `orientation` does "
+        "not jump."
     )
     xd = _RecordVector("Derivative of x, shape (K, m), m/s and rad/s.")
     wrench = _RecordVector(
         "Wrench in task space that is equivalent to tau_x, shape (K, m), N and N m."
     )
     ch = _RecordVector(
-        "All numbers that the site's control law sends to its peers, shape (K, C). `sent` has "
-        "them by name."
+        "All entries of the vectors that the site's control law sends to its peers, shape "
+        "(K, C). `sent` maps the name of each vector to its entries."
     )
     hand = _RecordVector(
         "Action of the person or program that holds the arm, shape (K, h), see `HandInForce`."
     )
     bodies = _RecordVector(
-        "Poses of the b bodies of the site's plant as recorded, shape (K, 7 b), m and "
-        "quaternions. The plant is a simulated environment that the arm moves in."
+        "Recorded poses of the b bodies in the site's plant, a simulated environment of the "
+        "arm, shape (K, 7 b), m and quaternions."
     )
     mem = _RecordField(
         _read_objects,
-        "State of the site and its control law that no other field contains, shape (K,), a "
-        "list of numbers each.",
+        "State of the site and its control law that is in no other field, shape (K,), as a "
+        "list of numbers per record.",
     )
     t_ns = _RecordField(
         _read_ints,
@@ -625,20 +625,20 @@ class SiteLog:
     )
     late_us = _RecordField(
         _read_ints,
-        "Delay of the tick's start after its nominal time, shape (K,), us. It is 0 in virtual "
+        "Time from the nominal to the actual start of the tick, shape (K,), us; 0 in virtual "
         "time.",
     )
     sent_ns = _RecordField(
         _read_ints,
-        "Time at which each record was sent, since the epoch, both read from the site's own "
-        "clock, shape (K,), ns.",
+        "Time since the epoch at which each record was sent, on the site's own clock, shape "
+        "(K,), ns.",
     )
 
     @cached_property
     def t_s(self) -> Array:
         """Nominal time since the epoch, the common start of the session, shape (K,), in s.
 
-        It is the ideal time of each tick, not the time at which the tick was computed.
+        This is the ideal time of each tick, not the time at which the tick was computed.
         """
         return freeze(self.t_ns / NS_PER_S)
 
@@ -646,8 +646,8 @@ class SiteLog:
     def orientation(self) -> Array:
         """Orientation of the end effector as unit quaternions (w, x, y, z), shape (K, 4).
 
-        A quaternion and its negative are the same orientation. The sign is chosen so that each
-        quaternion is nearest to the previous one. The shape is (K, 0) for sites that do not
+        A quaternion and its negative represent the same orientation. Signs are chosen to bring
+        each quaternion closest to the previous one. The shape is (K, 0) for sites that do not
         follow orientations.
         """
         return self._compute_orientation(self.x)
@@ -656,14 +656,14 @@ class SiteLog:
     def orientation_des(self) -> Array:
         """Orientation of the reference as unit quaternions (w, x, y, z), shape (K, 4).
 
-        The reference is the motion that the end effector of the arm follows, and K is the
-        number of records. The shape is (K, 0) for sites that do not follow orientations. The
-        signs are chosen so that each quaternion is nearest to the previous one.
+        The reference is the motion that the end effector follows, and K is the number of
+        records. The shape is (K, 0) for sites that do not follow orientations. Signs are chosen
+        to bring each quaternion closest to the previous one.
         """
         return self._compute_orientation(self.q_des)
 
     def _compute_orientation(self, poses: Array) -> Array:
-        """Computes unit quaternions from poses, shape (K, m).
+        """Converts poses of shape (K, m) to unit quaternions.
 
         Returns:
             The quaternions, shape (K, 4), or (K, 0) if the site does not follow orientations.
@@ -674,11 +674,11 @@ class SiteLog:
 
     @cached_property
     def body_poses(self) -> Array:
-        """Poses of the b bodies that the simulated environment of the arm contains.
+        """Poses of the b bodies in the simulated environment of the arm, shape (K, b, 7).
 
-        The shape is (K, b, 7). A pose is the position x, y, z in m and the orientation as a
-        unit quaternion w, x, y, z. A quaternion and its negative are the same orientation. Its
-        sign is chosen so that the quaternion is nearest to the previous one.
+        A pose consists of the position x, y, z in m and the orientation as a unit quaternion w,
+        x, y, z. A quaternion and its negative represent the same orientation. The sign is
+        chosen to bring the quaternion closest to the previous one.
         """
         poses = self.bodies.reshape(len(self), -1, POSITION + 4).copy()
         for body in range(poses.shape[1]):
@@ -700,12 +700,12 @@ class SiteLog:
 
     @cached_property
     def sent(self) -> dict[str, Array]:
-        """Numbers that the site's control law sends to the other sites in each control period.
+        """Quantities that the site's control law sends to the other sites in each tick.
 
-        A key is the name of the quantity in the control law, such as "E", if all other sites
-        receive the same numbers. If the numbers are meant for one site, the key also contains
-        its name, such as "u[m2]". The value is an array of shape (K, w), with K records and w
-        numbers of the quantity. Empty if the control law sends nothing.
+        Each key is the name of a quantity in the control law, such as "E", if all other sites
+        receive the same values. If the values are meant for one site, the key also contains its
+        name, such as "u[m2]". Each value is an array of shape (K, w), for K records and w
+        entries of the quantity. Empty if the control law sends nothing.
         """
         columns: dict[str, list[int]] = {}
         for column, entry in enumerate(self.channel.entries(self.peers)):
@@ -716,19 +716,18 @@ class SiteLog:
     def busy_us(self) -> Ints:
         """Computing time of each tick except the last one, shape (K - 1,), in us.
 
-        A record contains the computing time of the previous tick, because the time of its own
-        tick is not known yet when the record is published. The values are shifted by one row
+        A record contains the computing time of the previous tick, because that of its own tick
+        is not yet known when the record is published. The values are shifted by one row
         accordingly.
         """
         return self.numbers("busy_us")[1:]
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Which received state of each peer the control law used, in each of the K records.
+        """Tick of the sample of each peer that the control law used in each record.
 
-        A peer is another site (arm controller), and a sample is the state that it sends in each
-        tick (period of its control loop). The key is the name of the peer. The value has the
-        shape (K,), with the number of the tick, or -1 before the first sample of the peer.
+        Maps the name of each peer to an array of shape (K,). The tick is -1 before the first
+        sample of the peer.
         """
         if self.indexed is not None:
             ticks = self.indexed.used
@@ -737,11 +736,11 @@ class SiteLog:
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Messages from other arms that arrived at this arm, with their delays.
+        """Samples from other arms that arrived at this arm, with their delays.
 
-        The first array contains the number of messages (samples) in each record, shape (K,).
-        The second array contains all arrivals in order, shape (N, 3), with the columns of `rx`:
-        index of the peer, tick of the sample, and delay in us.
+        The first array contains the number of samples in each record, shape (K,). The second
+        lists all N arrivals in order, shape (N, 3), with the columns of `rx`: index of the
+        peer, tick of the sample, and delay in us.
         """
         if self.indexed is not None:
             return freeze(self.indexed.arrivals)
@@ -749,7 +748,7 @@ class SiteLog:
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
-        """Texts of the field `cmd` by tick, for the records that contain any."""
+        """Maps each tick whose record has a nonempty field `cmd` to the strings in it."""
         ticks = self.tick
         payloads = self.payloads
         if self.indexed is not None:
@@ -761,22 +760,21 @@ class SiteLog:
         return {tick: tick_texts for tick, tick_texts in pairs if tick_texts}
 
     def changes(self) -> dict[int, list[str]]:
-        """Lists the changes of settings that the arm controller (site) applied during the run.
+        """Lists the parameter changes that the site applied during the run.
 
         Returns:
-            For each tick with changes, the changes as JSON texts in the order of application.
+            Maps each tick with changes to the changes as JSON strings, in order of application.
         """
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Computes the age of the peer's sample that the control law used in each record.
+        """Computes the age of the peer's sample that the control law used in each record, in s.
 
         The age is the time of the record minus the stamp of the sample. The stamp is the
-        nominal time of the tick (control period) in which the peer computed the sample.
+        nominal time of the tick in which the peer computed the sample.
 
         Args:
-            peer: Name of the peer, another site (arm controller) whose samples this site
-                receives.
+            peer: Name of the peer.
             rate_hz: Tick rate of the peer, in Hz.
 
         Returns:
@@ -790,7 +788,7 @@ class SiteLog:
     def iterate_delays(
         self, peer: str, rate_hz: int, sent_ticks: Sequence[int]
     ) -> Iterator[TracePoint]:
-        """Yields the stamp and the delay of every sample of a peer, in the order of the stamps.
+        """Yields the stamp and the delay of every sample of a peer, in order of their stamps.
 
         A sample that was sent but did not arrive has an infinite delay. It is left out if it
         may have arrived in a tick whose record is missing. `Log.link_delays` defines the
@@ -799,8 +797,8 @@ class SiteLog:
         Args:
             peer: Name of the sender.
             rate_hz: Tick rate of the sender, in Hz.
-            sent_ticks: Ticks of the samples that the sender is known to have sent. If there are
-                none, samples of all ticks up to the last arrival count as sent.
+            sent_ticks: Ticks of the samples that the sender is known to have sent. If empty,
+                samples of all ticks up to the last arrival count as sent.
 
         Yields:
             The stamp in s after the start of the session, and the delay in ms.
@@ -838,11 +836,11 @@ class SiteLog:
     def _find_gaps_ns(self) -> list[tuple[int, float]]:
         """Returns the intervals in which a sample may have arrived although no record shows it.
 
-        Records (results of control periods) are missing before the first record, between
-        records whose ticks (control periods) are not consecutive, and after the last record.
+        Records are missing before the first record, between records whose ticks are not
+        consecutive, and after the last record.
 
         Returns:
-            The intervals (start, end) in ns after the start of the session.
+            The intervals (start, end), in ns after the start of the session.
         """
         states = self.states
         if not states:

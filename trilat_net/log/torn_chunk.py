@@ -1,17 +1,17 @@
-"""Recovers messages from a compressed block of a log that was cut off.
+"""Recovers messages from a truncated compressed chunk of a log.
 
 An MCAP file stores messages in compressed chunks. If a recording is interrupted, the last chunk
-may be incomplete. The checksum of such a chunk proves nothing, because it covers all messages
-of the chunk, including those at the missing end. But the compressed data consist of blocks,
-which can be unpacked one by one, and the messages of all complete blocks can be used.
+may be incomplete. Its checksum is then useless, because it covers all messages of the chunk,
+including those in the missing part. But the compressed data consist of blocks that can be
+decompressed one by one, so the messages of all complete blocks can be used.
 
 Invariant:
-    - The messages of a block are used together or not at all, because damage in the compressed
+    - The messages of a block are used together or not at all, because damage to the compressed
       bytes of a block may falsify any of its messages, including messages that still look
       correct.
     - Compressed bytes are read up to the first doubtful page. A page that contains only zeros
-      was never written to the disk. A page that is equal to another page of the file was
-      written to the wrong place.
+      was never written to the disk. A page that equals another page of the file was written to
+      the wrong place.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,27 +34,28 @@ from .mcap_records import (
 )
 
 PAGE_BYTES = 4096
-"""Size of a page, in bytes. Operating systems and disks lose or misplace whole pages of a file.
+"""Size of a page, in bytes. Operating systems and disks lose or misplace entire pages of a
+file.
 """
 _MAX_SALVAGE_BYTES = 64 << 20
-"""Largest part of an incomplete chunk that is read, in bytes."""
+"""Maximum number of bytes read from an incomplete chunk."""
 # Blocks of a Zstandard frame, from RFC 8878, section 3.1.1.2.
 _BLOCK_HEAD_BYTES = 3
 _RUN_LENGTH_BLOCK = 1
 _MAX_BLOCK_BYTES = 1 << 17
 
 InnerRecord = tuple[int, bytes]
-"""A record inside a chunk: its opcode and its content."""
+"""A record inside a chunk, as its opcode and content."""
 
 
 class TornChunk(NamedTuple):
-    """A compressed block of messages (chunk) whose end is missing from its file.
+    """A compressed chunk of messages whose end is missing from its file.
 
-    This happens when a recording is interrupted. The messages in the existing part can still be
-    recovered.
+    This happens when a recording is interrupted. The messages in the part that exists can still
+    be recovered.
 
     Attributes:
-        head: Head of the chunk, which describes the compressed records.
+        head: Header of the chunk, which describes the compressed records.
         packed: Compressed bytes of the chunk that exist and can be trusted.
         offset: Offset of the first compressed byte in the file.
     """
@@ -65,18 +66,18 @@ class TornChunk(NamedTuple):
 
     @classmethod
     def read(cls, scanner: RecordScanner, offset: int) -> "TornChunk":
-        """Reads the existing part of a chunk (compressed block of messages) that is cut off.
+        """Reads the existing part of a truncated chunk.
 
         Args:
             scanner: Scanner of the file.
             offset: Offset of the chunk in the file.
 
         Returns:
-            The head of the chunk, and its compressed bytes. The bytes end before the first page
-            of the file that was probably not written correctly, see `_find_doubtful_page`.
+            The header of the chunk, and its compressed bytes. The bytes end before the first
+            page of the file that was probably not written correctly, see `_find_doubtful_page`.
 
         Raises:
-            UnreadableRecord: The head of the chunk contains impossible values.
+            UnreadableRecord: The header of the chunk contains impossible values.
         """
         # Missing bytes are replaced by zeros, so that the code below refuses an incomplete
         # head.
@@ -93,16 +94,16 @@ class TornChunk(NamedTuple):
         return cls(head, packed, begin + head.data_offset)
 
     def iterate_blocks(self) -> Iterator[list[InnerRecord]]:
-        """Unpacks the intact part of the chunk block by block.
+        """Decompresses the intact part of the chunk block by block.
 
-        A block is a piece of the compressed data that can be unpacked as a whole. A record that
+        A block is a piece of the compressed data that is decompressed as a unit. A record that
         continues in the next block is yielded with the block that contains its end.
 
         Yields:
             The records of each block. Nothing if the first block is damaged or incomplete.
 
         Raises:
-            UnreadableRecord: The unpacked bytes are not a record.
+            UnreadableRecord: The decompressed bytes are not a record.
         """
         unpacked = bytearray()
         for block in self._unpack():
@@ -112,10 +113,10 @@ class TornChunk(NamedTuple):
             yield complete_records
 
     def _unpack(self) -> Iterator[bytes]:
-        """Yields the unpacked blocks, until a block is damaged or incomplete.
+        """Yields the decompressed blocks, until a block is damaged or incomplete.
 
-        It also stops if the total size of the blocks exceeds the size that the head of the
-        chunk states. If the chunk is not compressed, a block is a page of the file.
+        Also stops if the total size of the blocks exceeds the size stated in the header of the
+        chunk. If the chunk is not compressed, a block is a page of the file.
         """
         unpackers: dict[str, Callable[[bytes], Iterator[bytes]]] = {
             "": partial(_iterate_pages, offset=self.offset),
@@ -138,21 +139,21 @@ class TornChunk(NamedTuple):
 def _find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
     """Finds the first page in a part of a file that was probably not written correctly.
 
-    A page is a block of `PAGE_BYTES` that the operating system writes as a whole. If a computer
+    A page is a block of `PAGE_BYTES` that the operating system writes as a unit. If a computer
     loses power, some pages of a file may be missing or in the wrong place. A page of the part
     is therefore doubtful in two cases:
 
     - It contains only zeros: it was never written.
-    - It is equal to another page, in the part or before it. Compressed data hardly ever repeat
-      a whole page by chance. Probably the page was written to the wrong place.
+    - It equals another page, in the part or before it. Compressed data hardly ever repeat an
+      entire page by chance, so the page was probably written to the wrong place.
 
     Args:
         scanner: Scanner of the file.
         begin: Offset of the part's first byte.
-        end: Offset of the first byte after the part.
+        end: Offset after the part's last byte.
 
     Returns:
-        The offset of the page. It is `end` if no page is doubtful.
+        The offset of the page, or `end` if no page is doubtful.
     """
     # The first boundary of a page in the part: -(-a // b) rounds a / b up.
     first_page = -(-begin // PAGE_BYTES) * PAGE_BYTES
@@ -182,7 +183,7 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
     """Splits decompressed bytes into the complete records at their beginning.
 
     Args:
-        data: The unpacked bytes. They begin with a record.
+        data: The decompressed bytes, which begin with a record.
 
     Raises:
         UnreadableRecord: The bytes are not a record.
@@ -202,7 +203,7 @@ def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
 
 
 def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
-    """Splits bytes at the page boundaries of their file, as disks lose whole pages at once.
+    """Splits bytes at the page boundaries of their file, since disks lose entire pages.
 
     Args:
         packed: The bytes.
@@ -216,10 +217,10 @@ def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
 
 
 def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked complete blocks of a Zstandard frame.
+    """Yields the decompressed data of each complete block of a Zstandard frame.
 
-    A frame consists of a header and blocks (RFC 8878, section 3.1.1.2). The head of a block has
-    3 bytes: bit 0 marks the last block, bits 1 and 2 are the kind, and the others the size.
+    A frame consists of a header and blocks (RFC 8878, section 3.1.1.2). The header of a block
+    has 3 bytes: bit 0 marks the last block, bits 1 and 2 are the kind, and the others the size.
     """
     unpacker: Any = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompressobj()
     start = zstandard.frame_header_size(packed)
@@ -240,7 +241,7 @@ def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
 
 
 def _unpack_lz4(packed: bytes) -> Iterator[bytes]:
-    """Yields the unpacked data of an LZ4 frame by pages, up to the first incomplete part."""
+    """Yields the decompressed data of an LZ4 frame in pages, up to an incomplete part."""
     unpacker = lz4.frame.LZ4FrameDecompressor()
     for page in _iterate_pages(packed):
         yield unpacker.decompress(page)

@@ -1,12 +1,12 @@
 """Provides logs of simulations whose records stay in arrays and are not encoded as messages.
 
-A simulated run can be judged by the same functions as a recorded one, because they read the
-columns of a log, such as the joint angles of all records. `UnwrittenLog` offers these columns
-for numbers that a simulation left in memory. Encoding these numbers as messages and decoding
-them again would take twenty times as long as the simulation.
+The functions that analyse a recorded run read the columns of its log, such as the joint angles
+of all records. `UnwrittenLog` provides the same columns for arrays that a simulation left in
+memory, so a simulated run can be analysed in the same way. Encoding these arrays as messages
+and decoding them again would take twenty times as long as the simulation.
 
 Invariant:
-    - A column that was not given raises an error when it is read.
+    - Reading a column that was not provided raises an error.
     - The log is complete: it has a record of every tick of the scenario, and no events.
 """
 
@@ -30,12 +30,12 @@ _NAME = "run"
 class _UnwrittenSiteLog(SiteLog):
     """Results of one arm in a simulation without a log file, with one row per tick.
 
-    A tick is a control period. The class has the arrays of `SiteLog`.
+    Provides the arrays of `SiteLog`.
 
     Args:
         scenario: Scenario of the run.
         site: Name of the site.
-        columns: Fields of the records by name, with a row for each tick of the site.
+        columns: Maps the names of record fields to arrays with one row per tick of the site.
     """
 
     def __init__(self, scenario: Scenario, site: str, columns: Mapping[str, Any]) -> None:
@@ -60,7 +60,7 @@ class _UnwrittenSiteLog(SiteLog):
 
     @property
     def diverged_s(self) -> float | None:
-        """None, because no arm left its limits: every planned control period was executed."""
+        """Always None, since no arm exceeded its limits: every planned tick was executed."""
         return None
 
     def _read_from(self, *_: Any) -> Any:
@@ -79,8 +79,8 @@ class UnwrittenLog(Log):
 
     Args:
         scenario: Scenario of the run.
-        columns: Fields of the records of each site, by name of the site and name of the field
-            (see `SiteLog`). Each has a row for every tick.
+        columns: For each site, maps the names of record fields (see `SiteLog`) to arrays with
+            one row per tick.
     """
 
     def __init__(self, scenario: Scenario, columns: Mapping[str, Mapping[str, Any]]) -> None:

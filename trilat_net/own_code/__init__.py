@@ -1,13 +1,13 @@
-"""Runs code that users wrote, if a person has permitted it.
+"""Runs user-written code, once a person has permitted it.
 
-A scenario, the description of an experiment, may name classes of users: control laws, programs
-that move an arm, and plants (simulations of an arm). A scenario may come from an unknown
-author, so its code must not run without permission.
+A scenario may name user-written classes: control laws, programs that move an arm, and plants
+(simulations of an arm). Since a scenario may come from an unknown author, its code must not run
+without permission.
 
-- `imported_code` finds a class by its module and name, and imports it if it is permitted.
+- `imported_code` finds a class by module and name, and imports it if permitted.
 - `code_consent` manages permissions, for scenarios and logs from unknown authors.
-- `sent_channel` reads which vectors the source of a law sends, without running it.
-- `class_arguments` checks the arguments that a scenario gives to a class.
+- `sent_channel` reads which vectors a law sends from its source, without running it.
+- `class_arguments` checks the arguments that a scenario passes to a class.
 
 Invariant:
     - Nothing outside this package imports a module that a scenario or a log names.

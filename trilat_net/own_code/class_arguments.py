@@ -1,9 +1,9 @@
-"""Checks the arguments that a scenario gives to a user's class, and creates the instance.
+"""Checks the arguments that a scenario passes to a user's class, and creates the instance.
 
 The class is a control law, a hand (a program that moves an arm) or a plant (a model of an arm).
-Its arguments are the keys that the user wrote beside its name. An argument that the class does
-not have, or whose value has the wrong type, is refused before any code of the class runs. The
-error names the class, its file, the argument, and the arguments that the class has.
+Its arguments are the keys that the user wrote next to its name. An argument that the class does
+not have, or whose value has the wrong type, is rejected before any code of the class runs. The
+error names the class, its file, the argument, and the arguments that the class accepts.
 `list_default_arguments` reads the values of arguments that a scenario leaves out.
 """
 
@@ -19,13 +19,15 @@ _TYPE_NAMES: dict[type, tuple[tuple[type, ...], str]] = {
     int: ((int, float), "a number"),
     str: ((str,), "a text"),
 }
-"""For each checked type, the accepted types of values, and the name of the type in errors."""
+"""Maps each checked type to the accepted types of values and the name of the type in error
+messages.
+"""
 
 
 def make_own_instance(
     kind: Any, code: str, context: Any, settings: dict[str, Any], path: str
 ) -> Any:
-    """Creates an object of a user's class, after a check of its arguments.
+    """Creates an instance of a user's class, after checking its arguments.
 
     A wrong argument is reported with its path in the scenario, like any other wrong key, and
     not as an exception within the class. A class without a constructor receives neither the
@@ -33,14 +35,14 @@ def make_own_instance(
 
     Args:
         kind: The class.
-        code: Module and class, for example "mylaws:Spring", for errors.
-        context: First argument of the class: the facts about the site (arm controller).
+        code: Module and class, for example "mylaws:Spring", for error messages.
+        context: First argument of the class: the facts about the site.
         settings: Keyword arguments of the class.
-        path: Path of the table with the arguments in the scenario, for errors.
+        path: Path in the scenario of the table with the arguments, for error messages.
 
     Raises:
         ScenarioError: An argument is unknown, missing or of the wrong type, or the class raised
-            an exception, of any kind.
+            any exception.
     """
     _check_arguments(kind, code, settings, path)
     has_init = kind.__init__ is not object.__init__
@@ -58,16 +60,16 @@ def make_own_instance(
 
 
 def _check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: str) -> None:
-    """Rejects arguments in a scenario that a user's class does not accept.
+    """Raises ScenarioError if a user's class does not accept its arguments in the scenario.
 
-    The check compares them with the constructor of the class, before an object is created, so
-    that the error names the wrong key of the scenario.
+    The arguments are compared with the constructor of the class before an instance is created,
+    so that the error names the wrong key of the scenario.
 
     Args:
-        kind: The class, whose first argument is for the facts about the site.
-        code: Module and class, for example "mylaws:Spring", for errors.
-        settings: The keyword arguments, by name.
-        path: Path of the table with the arguments in the scenario, for errors.
+        kind: The class, whose first argument receives the facts about the site.
+        code: Module and class, for example "mylaws:Spring", for error messages.
+        settings: Maps the names of the keyword arguments to their values.
+        path: Path in the scenario of the table with the arguments, for error messages.
 
     Raises:
         ScenarioError: The class has no such argument, an argument without a default is missing,
@@ -108,13 +110,13 @@ def _check_arguments(kind: Any, code: str, settings: Mapping[str, Any], path: st
 
 
 def _describe_class(kind: Any, code: str) -> str:
-    """Returns the name of a user's class with the file of its constructor, for errors."""
+    """Returns the name of a user's class and the file of its constructor, for errors."""
     file = getattr(getattr(kind.__init__, "__code__", None), "co_filename", "")
     return f"{code} ({file})" if file else code
 
 
 def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: str) -> None:
-    """Checks that a value has the type that a user's class expects for an argument.
+    """Raises ScenarioError if a value does not have the type that a user's class expects.
 
     The type is that of the annotation. Without an annotation, it is the type of the default.
     The class may then accept other types such as lists, so only a string in place of a number,
@@ -123,8 +125,8 @@ def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: st
     Args:
         parameter: The argument.
         value: Its value in the scenario.
-        subject: Name of the class, for the error.
-        path: Path of the table with the arguments, for the error.
+        subject: Name of the class, for the error message.
+        path: Path of the table with the arguments, for the error message.
     """
     annotation = parameter.annotation
     if isinstance(annotation, str):  # a module with `from __future__ import annotations`
@@ -145,16 +147,17 @@ def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: st
 
 
 def list_default_arguments(content: bytes, name: str) -> dict[str, Any]:
-    """Returns the default values of the arguments of a user's class, without running its file.
+    """Returns the default values of a user's class's arguments, without running its file.
 
-    Defaults that are not written out as literals are given as their Python text.
+    A default that is not a literal is returned as its Python source text.
 
     Args:
         content: Content of the Python file.
         name: Name of the class.
 
     Returns:
-        Defaults by the name of the argument. Empty if the file does not define the arguments.
+        Maps the name of each argument to its default. Empty if the file does not define the
+        arguments.
     """
     tree = ast.parse(content)
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
@@ -170,10 +173,10 @@ def list_default_arguments(content: bytes, name: str) -> dict[str, Any]:
 
 
 def _list_defaults(arguments: ast.arguments) -> dict[str, Any]:
-    """Returns the default values of a Python function's arguments, by name.
+    """Maps the name of each argument of a Python function to its default value.
 
     Args:
-        arguments: The arguments, as Python's parser returns them.
+        arguments: The arguments, as returned by Python's parser.
     """
     positional = [*arguments.posonlyargs, *arguments.args]
     # Only the last of the positional arguments have defaults.

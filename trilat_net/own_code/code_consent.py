@@ -1,16 +1,16 @@
-"""Decides which code of users may run, and remembers permissions.
+"""Decides which user-written code may run, and remembers permissions.
 
-A scenario describes an experiment and may name classes that users wrote: control laws, programs
-that move an arm, and plants (simulations of an arm). Code that users name in their own scenario
-may run. A log, or another member of a session, may have an unknown author. Code that it names
-may run only if a person names the file of the code. The person may let the program remember the
-permission in the configuration folder.
+A scenario may name user-written classes: control laws, programs that move an arm, and plants
+(simulations of an arm). Code that users name in their own scenario may run. A log, or another
+member of a session, may have an unknown author, and code that it names may run only if a person
+names the file of the code. On request, the program remembers the permission in the
+configuration folder.
 
 Invariant:
-    - The file that a person names must have the hash that the log states, unless the person
+    - The file that a person names must have the hash stated in the log, unless the person
       explicitly allows another version.
     - A permission applies to one class in one file, with the arguments of one log. A log with
-      other arguments needs a permission of its own, and the error message says which arguments
+      other arguments needs its own permission, and the error message says which arguments
       differ.
 """
 
@@ -41,7 +41,7 @@ from .imported_code import (
 
 AnyScenario = TypeVar("AnyScenario", bound=ScenarioWithCode)
 LawFiles = str | Path | Sequence[str | Path]
-"""Path of a file with a user's code, or several such paths."""
+"""Path of a file with user-written code, or several such paths."""
 
 
 def list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
@@ -51,7 +51,7 @@ def list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
     compute the motion of an arm).
 
     Args:
-        scenario: Description of the experiment.
+        scenario: The scenario.
     """
     named: list[NamedCode] = []
     for site in scenario.sites.values():
@@ -66,8 +66,8 @@ def list_named_code(scenario: ScenarioWithCode) -> list[NamedCode]:
 def _names_code(kind: object) -> bool:
     """Returns True if scenario entries of the given class name a user's class.
 
-    The result is cached for each class, because `isinstance` with a protocol is slow: without
-    the cache, it took one twelfth of the time to reset a training environment.
+    The result is cached per class, because `isinstance` with a protocol is slow: without the
+    cache, it took one twelfth of the time needed to reset a training environment.
 
     Args:
         kind: Class of an entry of a scenario.
@@ -80,7 +80,7 @@ def allow_own_code(
     codes: Container[Any] | None = None,
     changed_from: ScenarioWithCode | None = None,
 ) -> AnyScenario:
-    """Permits users' classes to run, because a user of this process has named them.
+    """Permits user-written classes to run, because a user of this process has named them.
 
     Code that nobody has named or permitted is rejected, because a scenario from elsewhere may
     name harmful code.
@@ -88,10 +88,9 @@ def allow_own_code(
     Args:
         scenario: Scenario that names the code.
         codes: Classes that the user named, for example "package.module:Law". If None, the user
-            wrote the whole scenario, so all its code may run.
-        changed_from: Scenario that the user changed to get this scenario. Code that may run
-            there may run here as well, with its new arguments. None if there is no such
-            scenario.
+            wrote the complete scenario, so all its code may run.
+        changed_from: Scenario that the user modified to get this scenario. Code that may run
+            there may also run here, with its new arguments. None if there is no such scenario.
 
     Returns:
         The same scenario.
@@ -113,7 +112,7 @@ def allow_own_code(
 
 
 def import_named_class(code: str, path: str) -> Any:
-    """Imports a control law that a user of this process names, and thereby permits to run.
+    """Imports a control law that a user of this process has named, and so permitted to run.
 
     Args:
         code: Module and class, as in "mylaws:Spring".
@@ -129,11 +128,12 @@ def import_named_class(code: str, path: str) -> Any:
 
 
 class _RememberedFile(msgspec.Struct):
-    """File with a user's code that a person has permitted to run, as stored on disk.
+    """File with user-written code that a person has permitted to run, as stored on disk.
 
     Attributes:
         file: Path of the file.
-        classes: For each class of the file, the sets of arguments with which it may run.
+        classes: Maps the name of each class in the file to the sets of arguments with which it
+            may run.
     """
 
     file: str
@@ -147,20 +147,20 @@ def allow_logged_code(
     other_version: bool = False,
     remember: bool = False,
 ) -> None:
-    """Allows code that a log names to run, if a person has permitted it.
+    """Permits code that a log names to run, if a person has permitted it.
 
     A log may have an unknown author, so its code does not run without permission. A person
-    permits code by naming its file now, or by a permission stored earlier. See `open_log`.
+    permits code by naming its file now, or has stored a permission earlier. See `open_log`.
 
     Args:
         scenario: Scenario of the log, which names the code.
         law: Python files that the person permits to run. By default, no file is permitted.
-        other_version: If True, a file may differ from the file that ran.
-        remember: If True, the permission is stored for later logs.
+        other_version: True to allow a file to differ from the one that ran.
+        remember: True to store the permission for later logs.
 
     Raises:
-        UsageError: A file does not define code that the log names, or is another version of it;
-            or an option requires a file, and no file is named.
+        UsageError: A file does not define code that the log names, or is another version of it.
+            Also raised if an option requires a file and none is named.
         ScenarioError: A file cannot be read, or does not define such a class. No code has run.
     """
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
@@ -190,12 +190,12 @@ def allow_logged_code(
 
 
 def _load_remembered_settings(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Loads the arguments for which stored permissions were given.
+    """Loads the arguments to which stored permissions apply.
 
     A message about rejected code can then say which arguments differ.
 
     Args:
-        remembered: Stored permissions, by the hash of the file.
+        remembered: Maps the hash of each file to the stored permissions.
     """
     remembered_settings.clear()
     for sha256, entry in remembered.items():
@@ -211,16 +211,19 @@ def _class_of(key: CodeKey) -> str:
 
 
 def _find_store() -> Path:
-    """Returns the path of the file that stores the user's permissions to run others' code."""
+    """Returns the path of the file that stores the user's permissions to run code."""
     folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(folder, "trilat-net", "laws.json")
 
 
 def _read_store() -> dict[str, _RememberedFile]:
-    """Returns the permissions to run code that this user has stored, by the hash of the file.
+    """Returns the permissions to run code that this user has stored.
 
     If nothing was stored, or the file cannot be read, there are no permissions. Earlier
-    versions of the program stored only the path of a file; such an entry permits nothing.
+    versions of the program stored only the path of a file. Such an entry permits nothing.
+
+    Returns:
+        Maps the hash of each file to its permissions.
     """
     # A RuntimeError is raised if the user has no home folder.
     with suppress(OSError, ValueError, RuntimeError):
@@ -235,7 +238,7 @@ def _read_store() -> dict[str, _RememberedFile]:
 
 
 def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
-    """Replaces the permissions to run code in the user's file by the given permissions."""
+    """Replaces the permissions in the user's file with the given ones."""
     make_folder(_find_store().parent)
     # The file may be a link: people link their settings to a folder under version control.
     store = _find_store().resolve()
@@ -245,19 +248,19 @@ def _write_store(remembered: Mapping[str, _RememberedFile]) -> None:
 def _allow_file(
     file: Path, logged: Mapping[CodeKey, NamedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Permits a file named by the user to run as the code that a log names.
+    """Permits a file named by the user to run as code that a log names.
 
     The file belongs to the code that has the hash of the file. If there is no such code, it
-    belongs to the code whose module has the name of the file; it is then another version of
-    that code.
+    belongs to the code whose module has the name of the file, and is another version of that
+    code.
 
     Args:
-        file: The file.
-        logged: Code that the log names.
-        other_version: If True, the file may be another version.
+        file: Path of the file.
+        logged: Maps the key of the code that the log names to its entry in the scenario.
+        other_version: True if the file may be another version.
 
     Returns:
-        The hash of the file, and the keys of the code that was allowed.
+        The hash of the file, and the keys of the code that was permitted.
 
     Raises:
         UsageError: The file is not code that the log names, or is another version.
@@ -295,18 +298,18 @@ def _compare_hashes(key: CodeKey, sha256: str) -> str:
 
 
 class LoggedUserLaw(NamedTuple):
-    """Control law that a log names and that is a user's class, with its permission to run.
+    """User-written control law that a log names, with its permission to run.
 
     Attributes:
         code: Class of the law, for example "package.module:Law".
-        sites: Names of the sites (arm controllers) that the law controls.
+        sites: Names of the sites that the law controls.
         settings: Arguments of the class, as readable text.
         allowed: True if the file may run with these arguments.
-        file: The file that a person permitted, or else the file that Python's import finds for
-            the module. None if there is no such file.
+        file: The file that a person permitted, or else the file that Python's import system
+            finds for the module. None if there is no such file.
         changed: Text about the hashes if the file differs from the file that ran. Otherwise
             empty.
-        other_settings: Text about the difference if the code was permitted with other
+        other_settings: Text about the differences if the code was permitted with other
             arguments. Otherwise empty.
     """
 
@@ -326,7 +329,7 @@ class LoggedUserLaw(NamedTuple):
 
         Args:
             law: The law in the scenario.
-            sites: Names of the sites (arm controllers) that it controls.
+            sites: Names of the sites that it controls.
         """
         key = CodeKey.of(law)
         consent = key.find_consent()

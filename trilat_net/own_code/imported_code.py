@@ -1,19 +1,20 @@
-"""Imports classes that users wrote, if a person has permitted it.
+"""Imports user-written classes, once a person has permitted them.
 
 A scenario names a class by its module and its name, for example `law = "package.module:Law"`.
-Importing a module runs its code, and a scenario may have an unknown author. Therefore a person
-must permit the code first. A permission applies to one class in one file, which is identified
-by its SHA-256 hash.
+Importing a module runs its code, and a scenario may have an unknown author, so a person must
+permit the code first. A permission applies to one class in one file, which is identified by its
+SHA-256 hash.
 
 Invariant:
     - A scenario contains the hash of the file that defines a class. If a run is repeated from
       its log, the hash shows whether the code is still the code that ran.
     - Looking up a class by its name runs no code, not even that of the enclosing packages.
-    - `CodeKey.import_class` is the only way to run code of users. It imports a class only if
-      `allowed_code` contains a permission, and if the file still has the permitted hash and
+    - `CodeKey.import_class` is the only way to run user-written code. It imports a class only
+      if `allowed_code` contains a permission, and if the file still has the permitted hash and
       defines a class of that name.
-    - A permission includes the arguments of the class. Harmless code may do harm with other
-      arguments, for example if an argument is the name of a file that it overwrites.
+    - A permission includes the arguments of the class, because code that is harmless with some
+      arguments may do harm with others, for example if an argument is the name of a file to
+      overwrite.
 """
 
 import ast
@@ -40,25 +41,26 @@ from .sent_channel import parse_classes
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
-"""For each module that Python's import has loaded, the hash that its file had then."""
+"""Maps each module that Python's import system has loaded to the hash that its file had then.
+"""
 
 
 Watch = Callable[[int, Callable[[], Any]], Any]
-"""Function that calls a user's code and returns its result, for example with a time limit.
+"""Function that calls user-written code and returns its result, for example with a time limit.
 
 Its arguments are the tick and the call, a function without arguments.
 """
 
 
 def call_directly(_k: int, function: Callable[[], Any]) -> Any:
-    """Calls a user's code without a time limit.
+    """Calls user-written code without a time limit.
 
-    In a live session, a user's code must not delay the control loop, so its calls are watched.
-    This function takes the place of such a `Watch` in virtual time, in which no other process
-    waits for the result.
+    In a live session, user-written code must not delay the control loop, so its calls are
+    monitored by a `Watch`. In virtual time, where no other process waits for the result, this
+    function takes its place.
 
     Args:
-        _k: Number of the tick in which the call is made. It is not used.
+        _k: Tick in which the call is made. Not used.
         function: Function without arguments that makes the call.
 
     Returns:
@@ -68,7 +70,7 @@ def call_directly(_k: int, function: Callable[[], Any]) -> Any:
 
 
 class NamedCode(Protocol):
-    """Interface of an entry of a scenario that names a user's class.
+    """Protocol for an entry of a scenario that names a user-written class.
 
     The class is a control law, an operator (a program that moves an arm) or a plant (a program
     that computes the motion of an arm).
@@ -85,47 +87,47 @@ class NamedCode(Protocol):
 
     @property
     def source_sha256(self) -> str:
-        """SHA-256 hash of the file of the module, which shows whether the file has changed."""
+        """SHA-256 hash of the module's file, which shows whether the file has changed."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments by name with which an object of the user's class is created."""
+        """Maps the names of the constructor arguments of the user's class to their values."""
 
 
 class _SiteWithCode(Protocol):
-    """Interface of the part of a scenario that describes one arm and the users' classes for it.
+    """Protocol for the part of a scenario that describes one arm and its user-written classes.
 
     These are its control law, the programs that move the arm, and the model of the arm. The
-    checks of permissions search here for users' classes, without importing the scenario's
+    permission checks search here for user-written classes, without importing the scenario's
     types.
     """
 
     @property
     def control(self) -> Any:
-        """Control law of the arm, possibly a user's class."""
+        """Control law of the arm, possibly a user-written class."""
 
     @property
     def hands(self) -> Sequence[Any]:
-        """Persons and programs who move the arm. A program may be a user's class."""
+        """Persons and programs who move the arm. A program may be a user-written class."""
 
     @property
     def plant(self) -> Any:
-        """What computes or measures the motion of the arm, possibly a user's class."""
+        """The plant that computes or measures the arm's motion, possibly a user's class."""
 
 
 class ScenarioWithCode(Protocol):
-    """Interface of a scenario, the description of an experiment, which may name users' classes.
+    """Protocol for a scenario that may name user-written classes.
 
-    Only the attributes that the checks of permissions need are listed.
+    Lists only the attributes that the permission checks need.
     """
 
     @property
     def sites(self) -> Mapping[str, _SiteWithCode]:
-        """Description of each arm's process (site), by name."""
+        """Maps the name of each site to its description."""
 
 
 ANY_SETTINGS = "*"
-"""Used in place of the arguments of a class if a permission applies to all arguments.
+"""Replaces the arguments of a class in a permission that applies to all arguments.
 
 Only the worker processes of a study receive such a permission, because a study varies the
 arguments itself.
@@ -133,15 +135,15 @@ arguments itself.
 
 
 class CodeKey(NamedTuple):
-    """Identification of a user's code: a class, the hash of its file and its arguments.
+    """Identifies user-written code by its class, the hash of its file and its arguments.
 
     A person permits code to run under this key. If the file or an argument changes, the
     permission no longer applies.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
-        sha256: SHA-256 hash of the file, as the scenario states it.
-        settings: Arguments of the class as a JSON text with sorted keys, or `ANY_SETTINGS`.
+        sha256: SHA-256 hash of the file, as stated in the scenario.
+        settings: Arguments of the class as a JSON string with sorted keys, or `ANY_SETTINGS`.
     """
 
     code: str
@@ -165,21 +167,20 @@ class CodeKey(NamedTuple):
         )
 
     def find_consent(self) -> "CodeConsent | None":
-        """Returns the permission under which a user's class may run with its arguments.
-
-        The result is None if nobody has permitted the class, its present file or its arguments.
+        """Returns the permission that lets a user's class run with its arguments.
 
         Returns:
-            The permission. None if the code may not run.
+            The permission, or None if nobody has permitted the class, its current file or its
+            arguments.
         """
         return allowed_code.get(self) or allowed_code.get(self._replace(settings=ANY_SETTINGS))
 
     def describe_new_settings(self) -> str:
-        """Explains why a user's class that was permitted before is refused with new arguments.
+        """Explains why a user's class that was permitted before is rejected with new arguments.
 
-        A permission applies only to certain arguments of a class. The text states how the
-        arguments of the refused code differ from permitted ones. If several sets of arguments
-        were permitted, those with the fewest differences are compared.
+        A permission applies only to certain arguments of a class. The explanation states how
+        the arguments of the rejected code differ from permitted ones. If several sets of
+        arguments were permitted, the one with the fewest differences is used.
 
         Returns:
             Part of a sentence. Empty if the code was not permitted with any arguments.
@@ -206,8 +207,8 @@ class CodeKey(NamedTuple):
     def import_class(self, path: str, method: str = "torque") -> Any:
         """Imports a user's class from its permitted file.
 
-        The file must be the file that a person permitted. It is checked before any of its code
-        runs.
+        The file must be the one that a person permitted, which is checked before any of its
+        code runs.
 
         Args:
             path: Path of the key in the scenario, for error messages.
@@ -216,8 +217,8 @@ class CodeKey(NamedTuple):
         Raises:
             CodeWithheld: There is no permission.
             ScenarioError: The file differs from the permitted one, or does not define such a
-                class; none of its code has run in these cases. Also raised if the code raises
-                an error while it is imported.
+                class, in which case none of its code has run. Also raised if the code raises an
+                error while it is imported.
         """
         code = self.code
         module, _, name = code.partition(":")
@@ -257,12 +258,12 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """Permission of a person to run the code of one Python file, which a scenario names.
+    """Permission by a person to run the code of one Python file that a scenario names.
 
     Attributes:
-        file: Path of the file. If None, it is the file that Python's import finds for the
+        file: Path of the file. If None, the file that Python's import system finds for the
             module.
-        sha256: SHA-256 hash that the file must have. Otherwise the permission does not apply.
+        sha256: SHA-256 hash that the file must have for the permission to apply.
     """
 
     file: Path | None
@@ -273,10 +274,10 @@ CodeConsents = dict[CodeKey, CodeConsent]
 allowed_code: CodeConsents = {}
 """Permissions for this process. Worker processes receive a copy."""
 remembered_settings: dict[tuple[str, str], list[str]] = {}
-"""Arguments that were permitted in earlier sessions, as the JSON text of `CodeKey.settings`.
+"""Arguments that were permitted in earlier sessions, as the JSON strings of `CodeKey.settings`.
 
-The keys are the hash of the file and the name of the class. The texts serve only to explain
-what differs if code is refused; they permit nothing.
+The keys are the hash of the file and the name of the class. The strings only serve to explain
+what differs if code is rejected. They permit nothing.
 """
 
 
@@ -288,7 +289,7 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
     varies the arguments itself, so it needs a wider permission.
 
     Args:
-        allowed: Permissions of the code that is studied.
+        allowed: Permissions for the code under study.
     """
     widened_permissions = {
         key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()
@@ -307,9 +308,9 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
 def _list_differences(
     old_settings: Mapping[str, Any], new_settings: Mapping[str, Any]
 ) -> list[str]:
-    """Returns a string for each argument whose value differs, such as "gain = 5 (was 3)".
+    """Returns one string per argument whose value differs, such as "gain = 5 (was 3)".
 
-    An argument that one of the two sets does not contain has its default value in this set.
+    An argument that is missing from one of the two sets has its default value there.
     """
     old_texts = {key: describe_setting(value) for key, value in old_settings.items()}
     new_texts = {key: describe_setting(value) for key, value in new_settings.items()}
@@ -323,14 +324,14 @@ def _list_differences(
 
 
 LONGEST_SETTING = 300
-"""Largest length up to which an argument is shown completely. Paths are usually shorter."""
+"""Maximum length up to which an argument is shown completely. Paths are usually shorter."""
 
 
 def describe_setting(value: Any) -> str:
     """Returns the value of an argument as a string for messages.
 
-    It is a JSON text, which contains no control characters. A long text is shortened in the
-    middle, because paths of files differ at their ends.
+    The string is JSON, which contains no control characters. A long string is shortened in the
+    middle, because file paths differ at their ends.
 
     Args:
         value: Value of the argument, of any type that JSON supports.
@@ -343,20 +344,20 @@ def describe_setting(value: Any) -> str:
 
 
 _executed: dict["_CodeSource", Any] = {}
-"""Modules that were executed from a file that a person named, by the content of the file."""
+"""Maps each file that a person named, with its content, to the module executed from it."""
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
-    """Control law of a scenario whose torques a user's Python class computes.
+    """Control law of a scenario that is implemented by a user-written Python class.
 
-    The scenario names the class and the hash of its file. It does not import the class, so a
-    scenario from an unknown author can be read without running its code.
+    The scenario names the class and the hash of its file. The class is not imported when the
+    scenario is read, so a scenario from an unknown author can be read without running its code.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
-        source_sha256: SHA-256 hash of the file of the module.
-        settings: Arguments of the class, by name.
-        sends: Vectors that the law sends to its peers, as the class declares them.
+        source_sha256: SHA-256 hash of the module's file.
+        settings: Maps the names of the class's arguments to their values.
+        sends: Vectors that the law sends to its peers, as declared by the class.
     """
 
     method: ClassVar[str] = "torque"
@@ -367,14 +368,14 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def read_default_settings(self) -> dict[str, Any]:
-        """Returns the defaults of the arguments of the class, for those not in the scenario.
+        """Returns the defaults of the class's arguments, used if the scenario omits them.
 
-        They are read from the file of the law, which is not run. Defaults that are not written
-        out as literals are given as their Python text.
+        They are read from the file of the law, which is not run. A default that is not a
+        literal is returned as its Python source text.
 
         Returns:
-            Defaults by the name of the argument. Empty if the file is missing, has changed
-            since the scenario was made, or does not define the arguments.
+            Maps the name of each argument to its default. Empty if the file is missing, has
+            changed since the scenario was made, or does not define the arguments.
         """
         try:
             source = read_code(self.code, "control.law")
@@ -385,13 +386,13 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
         return list_default_arguments(source.content, self.code.partition(":")[2])
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns a function that creates the control law for a site (arm controller).
+        """Returns a function that creates the control law for a site.
 
         The user's class is imported only when the returned function is called.
 
         Args:
-            sites: Number of sites of the experiment.
-            scheme: Integration scheme of the experiment.
+            sites: Number of sites in the scenario.
+            scheme: Integration scheme of the scenario.
         """
 
         def make(context: LawContext) -> UserLaw:
@@ -417,9 +418,9 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
 
 class _CodeSource(NamedTuple):
-    """Python file that defines a user's class, as it was read from disk.
+    """Python file that defines a user's class, as read from disk.
 
-    Its content is stored, so that exactly the checked text is run.
+    The content is stored, so that exactly the checked text is run.
 
     Attributes:
         file: Path of the file.
@@ -432,10 +433,9 @@ class _CodeSource(NamedTuple):
     sha256: str
 
     def check_class(self, code: str, path: str, method: str = "torque") -> None:
-        """Checks that the file defines a given class with a given method.
+        """Raises ScenarioError unless the file defines a given class with a given method.
 
-        The check parses the file and runs no code of it, because the code may not have been
-        permitted to run yet.
+        The file is parsed but not run, because the code may not have been permitted yet.
 
         Args:
             code: Module and class, for example "package.module:Law".
@@ -468,14 +468,15 @@ class _CodeSource(NamedTuple):
 
 
 def read_code(code: str, path: str, file: Path | None = None) -> _CodeSource:
-    """Reads the file that defines a class, without running any code of it.
+    """Reads the file that defines a class, without running any of its code.
 
-    Its hash shows whether a permission applies to it.
+    The hash of the file determines whether a permission applies to it.
 
     Args:
         code: Module and class, for example "package.module:Law".
         path: Path of the key in the scenario, for error messages.
-        file: The file. If None, it is the file that Python's import finds for the module.
+        file: Path of the file. If None, the file that Python's import system finds for the
+            module.
 
     Raises:
         ScenarioError: There is no such file, or it cannot be read.
@@ -518,14 +519,14 @@ def _find_file(code: str, path: str) -> Path:
 def _find_spec(module: str) -> ModuleSpec | None:
     """Finds a module in the same way as an import does, but without importing its packages.
 
-    Only Python's path finder and the finders of editable installations are asked. Other finders
+    Only Python's path finder and the finders of editable installations are used. Other finders
     may run code: that of `distutils` imports the nearest setuptools.
 
     Args:
         module: Name of the module, with dots.
 
     Returns:
-        The spec of the module, which contains its file. None if it is not found.
+        The spec of the module, which contains its file, or None if it is not found.
     """
     finders = [
         finder
@@ -556,8 +557,8 @@ def _find_spec(module: str) -> ModuleSpec | None:
 def _find_import_folder(module: str, file: Path) -> Path:
     """Returns the folder that must be on Python's search path to import a module from a file.
 
-    For a plain module, it is the folder of the file. For a module in packages, it is the folder
-    that contains the outermost package.
+    For a plain module, this is the folder of the file. For a module in packages, it is the
+    folder that contains the outermost package.
     """
     depth = module.count(".") + (file.stem == "__init__")
     return file.parents[min(depth, len(file.parents) - 1)]
@@ -568,17 +569,19 @@ PAGES = {
     "act": ("hand", "policies.md"),
     "step": ("plant", "own-plant.md"),
 }
-"""For each required method, the name of this kind of class, and its documentation page."""
+"""Maps each required method to the name of the kind of class that has it, and its documentation
+page.
+"""
 
 
 def _import(module: str, sha256: str) -> Any:
-    """Imports a module in Python's usual way, and reloads it if its file has changed.
+    """Imports a module in Python's usual way, reloading it if its file has changed.
 
     In a notebook, for example, a user may edit a control law and simulate it again.
 
     Args:
         module: Name of the module.
-        sha256: Present hash of its file.
+        sha256: Current hash of its file.
     """
     imported = importlib.import_module(module)
     if _imported.setdefault(module, sha256) != sha256:
@@ -594,7 +597,7 @@ def _execute(module: str, source: _CodeSource) -> Any:
     again, or load a compiled version of it from `__pycache__`.
 
     Args:
-        module: Name that the module gets.
+        module: Name for the module.
         source: The file and its content.
     """
     if source in _executed:
@@ -618,7 +621,7 @@ def _execute(module: str, source: _CodeSource) -> Any:
 
 
 def _name_law_class(kind: type) -> str:
-    """Returns the name with which a scenario names a user's class.
+    """Returns the name by which a scenario refers to a user's class.
 
     For example, the class Spring in the file mylaws.py has the name "mylaws:Spring".
 
@@ -644,10 +647,10 @@ def _name_law_class(kind: type) -> str:
 
 
 def name_law_classes(value: Any) -> Any:
-    """Converts a value that a Python program passed to types that TOML supports.
+    """Converts a value passed by a Python program to types that TOML supports.
 
-    A user's class becomes its name (see `_name_law_class`), and a number or an array of NumPy
-    becomes a number or a list. Tables are converted entry by entry. Other values are returned
+    A user's class becomes its name (see `_name_law_class`), and a NumPy number or array becomes
+    a number or a list. Tables are converted entry by entry. Other values are returned
     unchanged.
 
     Args:
@@ -664,11 +667,10 @@ def name_law_classes(value: Any) -> Any:
 def _searching(folder: Path | None) -> Iterator[None]:
     """Makes Python search one folder for modules before all others, inside the `with` block.
 
-    A user's class can thus import other files that lie beside its own file.
+    This lets a user's class import other files from the folder of its own file.
 
     Args:
-        folder: The folder. If None, it is the working directory, unless Python searches it
-            already.
+        folder: The folder. If None, the working directory, unless Python already searches it.
     """
     search_path = str(folder or Path.cwd())
     if folder is None and search_path in sys.path:

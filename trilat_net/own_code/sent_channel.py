@@ -24,12 +24,12 @@ from ..records import Layout
 def build_channel(sends: SentVectorSpecs, layout: Layout, peers: int) -> LawChannel:
     """Returns the vectors that a law sends from a site, with their lengths, in message order.
 
-    A law declares the vectors without knowing the arm. Their lengths follow from the counts of
+    A law declares the vectors without knowing the arm. Their lengths follow from the numbers of
     joints and coordinates.
 
     Args:
-        sends: Declared vectors by name.
-        layout: Counts of the site's joints and coordinates.
+        sends: Maps the name of each declared vector to its declaration.
+        layout: Numbers of the site's joints and coordinates.
         peers: Number of the site's peers.
     """
     counts = {"joints": layout.joints, "coordinates": layout.shared}
@@ -45,18 +45,18 @@ def build_channel(sends: SentVectorSpecs, layout: Layout, peers: int) -> LawChan
 
 
 def check_sends(channel: LawChannel, joints: int, path: str) -> None:
-    """Checks the vectors that a control law declares to send: their names and total length.
+    """Raises ScenarioError if the vectors that a law sends have invalid names or are too long.
 
-    The vectors travel in each network message between arms, and a long message would take too
+    The vectors are part of each network message between arms, and a long message would take too
     much time.
 
     Args:
-        channel: All vectors that the law sends to other sites (arm controllers).
+        channel: All vectors that the law sends to other sites.
         joints: Number of joints of the site's arm.
         path: Path of the law's settings in the scenario file, for error messages.
 
     Raises:
-        ScenarioError: A name is not allowed, or the vectors have more numbers than a message or
+        ScenarioError: A name is not allowed, or the vectors have more entries than a message or
             a log entry can hold.
     """
     sends_path = f"{path}.sends"
@@ -88,7 +88,7 @@ def _find_name_problem(name: str) -> str:
     """Returns the reason why a name is unsuitable for a vector.
 
     A law reads the vector as an attribute of its input, so the name must be an identifier, and
-    must not be an attribute that the input has already.
+    must not be an existing attribute of the input.
 
     Returns:
         The reason. Empty if the name is suitable.
@@ -110,15 +110,17 @@ def _find_name_problem(name: str) -> str:
 
 
 def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDef]:
-    """Returns the classes in a Python file by name, without running the file.
+    """Returns the top-level classes in a Python file, without running the file.
 
-    Only classes at the top level are included. The file is only parsed, because the code may
-    not have been permitted to run yet.
+    The file is only parsed, because the code may not have been permitted to run yet.
 
     Args:
         source: Content of the file.
-        file: The file, for errors.
-        path: Path of the key, for errors.
+        file: Path of the file, for error messages.
+        path: Path of the key in the scenario, for error messages.
+
+    Returns:
+        Maps the name of each class to its syntax tree.
 
     Raises:
         ScenarioError: The file is not valid Python.
@@ -141,9 +143,9 @@ def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpe
 
     Args:
         source: Content of the file.
-        file: The file, for errors.
+        file: Path of the file, for error messages.
         code: Name of the law, as in "mylaws:Line".
-        path: Path of the key, for errors.
+        path: Path of the key in the scenario, for error messages.
 
     Raises:
         ScenarioError: The file is not valid Python, or the declaration is not a literal that

@@ -1,23 +1,22 @@
 """Connects a running session with ROS 2 programs, in both directions.
 
-A session consists of sites, processes that each run one arm. The bridge publishes the states of
-the sites as standard ROS messages, and offers the orders to stop and enable arms as ROS
-services. In the other direction, a ROS topic can
+The bridge publishes the states of the sites as standard ROS messages, and offers the orders to
+stop and enable arms as ROS services. In the other direction, a ROS topic can
 
 - command an arm, like an operator who holds it,
-- set the weights with which a site follows its peers,
+- set the dominance factors of a site,
 - or be the robot that is the external arm of a site.
 
 Invariant:
-    - ROS is never part of a control loop. A ROS message enters a session only as a target of an
-      operator, which the site limits and records, or as a measurement of an external arm. A log
+    - ROS is never part of a control loop. A ROS message enters a session only as an operator's
+      target, which the site limits and records, or as a measurement of an external arm. A log
       can therefore be verified without ROS.
-    - If two programs publish on a topic that commands an arm, the messages of both are refused.
-      The arm would otherwise move back and forth between two targets.
+    - If two programs publish on a topic that commands an arm, the messages of both are
+      rejected. The arm would otherwise move back and forth between two targets.
     - If no target arrives for 200 ms, the arm is released, because the program may have died.
     - A robot for which no valid torque is available receives its safe command repeatedly.
-    - A message that cannot be used does not end the bridge. The message is refused, and counted
-      by reason. The first refusal for each reason is printed.
+    - An unusable message does not end the bridge. It is rejected, and counted under the reason
+      for the rejection. The first rejection for each reason is printed.
 """
 
 import math
@@ -66,7 +65,7 @@ from trilat_net.scenario import Scenario, parse_embedded
 from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
 
 POLL_NS = 1_000_000
-"""Shortest time between two polls for messages of the session, in ns."""
+"""Minimum time between two polls for messages of the session, in ns."""
 POLLS_PER_RECORD = 5.0
 """Number of polls in the time between two published records."""
 LOOK_PERIOD_NS = 200_000_000
@@ -74,7 +73,7 @@ LOOK_PERIOD_NS = 200_000_000
 SILENCE_NS = 200_000_000
 """Time without a target after which an arm is released, in ns."""
 SENDER_TIMEOUT_NS = NS_PER_S
-"""Time for which a publisher counts as present after its last message, in ns."""
+"""Time after its last message for which a publisher counts as present, in ns."""
 SAFE_PERIOD_NS = 10_000_000
 """Time between two safe commands to a robot, in ns."""
 DRIVE_PERIOD_S = 0.001
@@ -82,25 +81,25 @@ DRIVE_PERIOD_S = 0.001
 NOTICE_PERIOD_S = 0.5
 """Time between two checks for measurements of a robot, in s."""
 FIRST_NOTICE_NS = 2 * NS_PER_S
-"""Time without a measurement of a robot after which the user is first told, in ns."""
+"""Time without a measurement of a robot after which the user is first notified, in ns."""
 NEXT_NOTICE_NS = 60 * NS_PER_S
-"""Time without a measurement after which the user is told again, in ns."""
+"""Time without a measurement after which the user is notified again, in ns."""
 REQUEST_PERIOD_S = 0.05
-"""Time between two checks for new weights, in s."""
+"""Time between two checks for new dominance factors, in s."""
 TRIGGER = "std_srvs/srv/Trigger"
-"""Type of the services, whose requests have no content."""
+"""Type of the services, whose requests are empty."""
 INBOX_MESSAGES = 4096
 """Capacity of each queue of messages from the session."""
 
 JointNames = Sequence[Sequence[str]]
-"""For each joint of an arm, the names that the joint may have in ROS messages."""
+"""For each joint of an arm, the alternative names of the joint in ROS messages."""
 
 
 class _SingleSender:
-    """Checks for each message of a topic that only one program publishes on the topic.
+    """Checks that only one program publishes on a topic, for each of its messages.
 
     Two programs that command the same arm would move it back and forth. The messages of both
-    are refused until one of them has not published for `SENDER_TIMEOUT_NS`.
+    are rejected until one of them has not published for `SENDER_TIMEOUT_NS`.
 
     Args:
         clock: Clock of this process.
@@ -114,12 +113,12 @@ class _SingleSender:
         self._conflict_ns = self._received_ns
 
     def admit(self, publisher: bytes) -> int:
-        """Accepts a publisher's message, or refuses it if another publisher is present.
+        """Accepts a publisher's message, or raises ValueError if there is another publisher.
 
-        While two publishers send messages, the messages of both are refused.
+        While two publishers send messages, the messages of both are rejected.
 
         Args:
-            publisher: Identity of the publisher in its message, see `Attachment.gid`.
+            publisher: Identity of the publisher as stated in the message, see `Attachment.gid`.
 
         Returns:
             The time since the previous message, in ns.
@@ -149,13 +148,13 @@ class TargetTopic:
     """Subscription to a ROS topic on which another program commands an arm.
 
     The topic is `target_pose`, `target_joint` or `target_wrench`. Each message is converted to
-    a target, which is sent to the site of the arm. For the site, the ROS program is the
-    operator who holds the arm.
+    a target and sent to the site of the arm, which treats the ROS program as the operator who
+    holds the arm.
 
     Args:
         hand: Connection to the site, in the role of the operator.
-        read: Function that converts a message to a target. It raises ValueError if the message
-            is not valid.
+        read: Function that converts a message to a target. Raises ValueError for an invalid
+            message.
         apply: Function that sends a target to the site.
         clock: Clock of this process.
 
@@ -180,19 +179,18 @@ class TargetTopic:
         self._received_ns: int | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Receives a message on the topic, and sends its target to the arm's site (process).
+        """Receives a message on the topic, and sends its target to the arm's site.
 
-        The method is called in a thread of the network library Zenoh.
+        Called in a thread of the network library Zenoh.
 
         Args:
             data: The message, encoded in CDR, the binary format of ROS 2.
-            attachment: Additional data of the message, which identify the program that
-                published it.
+            attachment: Additional data of the message that identify the publishing program.
 
         Raises:
             ValueError: The message cannot be read, or two programs publish on the topic. In the
                 second case, the arm is released.
-            TrilatError: The target is refused.
+            TrilatError: The target is rejected.
         """
         with self._lock:
             # Two programs that command the arm would move it back and forth.
@@ -208,8 +206,8 @@ class TargetTopic:
     def watch(self) -> None:
         """Releases the arm if the ROS program has sent no target for `SILENCE_NS`.
 
-        The bridge calls this method regularly, so that an arm is not held by a program that has
-        failed.
+        The bridge calls this method regularly, so that a program that has failed does not keep
+        holding the arm.
         """
         with self._lock:
             if self._received_ns is None:
@@ -219,7 +217,7 @@ class TargetTopic:
                 self._release_hand()
 
     def _release_hand(self) -> None:
-        """Releases the arm if the targets of a ROS 2 topic move it at present.
+        """Releases the arm if it is currently moved by targets from a ROS 2 topic.
 
         The next target takes control of the arm again.
         """
@@ -229,16 +227,16 @@ class TargetTopic:
 
 
 class DominanceTopic:
-    """Subscription to a ROS topic that sets the weights with which a site follows its peers.
+    """Subscription to a ROS topic that sets the dominance factors of a site.
 
-    The topic is `set_dominance`. Requests to the site wait for its reply and are therefore sent
-    by a thread of their own. If several messages arrive during this wait, only the newest is
+    The topic is `set_dominance`. Requests to the site wait for its reply, and are therefore
+    sent by a separate thread. If several messages arrive during this wait, only the newest is
     used. Messages that repeat the last request are ignored, unless no message has arrived for a
     second.
 
     Args:
-        peers: Names of the peers, in the order of the weights in a message.
-        change: Function that requests weights from the site, and waits for its reply.
+        peers: Names of the peers, in the order of the dominance factors in a message.
+        change: Function that requests dominance factors from the site, and waits for its reply.
         clock: Clock of this process.
     """
 
@@ -255,16 +253,15 @@ class DominanceTopic:
         self._sent_request: dict[str, float] | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Receives a message with the weights with which an arm follows the other arms.
+        """Receives a message with the dominance factors of a site.
 
-        The weights are stored until `send_request` sends them to the site. The method is called
-        in a thread of the network library Zenoh.
+        They are stored until `send_request` sends them to the site. Called in a thread of the
+        network library Zenoh.
 
         Args:
-            data: The message, encoded in CDR, the binary format of ROS 2. It has one weight per
-                peer.
-            attachment: Additional data of the message, which identify the program that
-                published it.
+            data: The message, encoded in CDR, the binary format of ROS 2. It contains one
+                dominance factor per peer.
+            attachment: Additional data of the message that identify the publishing program.
 
         Raises:
             ValueError: The message cannot be read, or two programs publish on the topic.
@@ -285,13 +282,12 @@ class DominanceTopic:
         self._requested = dict(peer_shares)
 
     def send_request(self) -> None:
-        """Asks the site to use the newest weights with which its arm follows the other arms.
+        """Requests the site to use the newest dominance factors, and waits for its reply.
 
-        The method waits for the reply of the site (arm controller). If no new weights have
-        arrived since the last call, it does nothing.
+        Does nothing if no new dominance factors have arrived since the last call.
 
         Raises:
-            TrilatError: The site rejects the weights.
+            TrilatError: The site rejects the dominance factors.
         """
         requested = self._requested
         if requested is not None and requested != self._sent_request:
@@ -300,13 +296,13 @@ class DominanceTopic:
 
 
 class _SilenceNotice:
-    """Composes notices for the user while a robot sends no measurement.
+    """Composes notices for the user while a robot sends no measurements.
 
     The first notice is due after `FIRST_NOTICE_NS` without a measurement, and further notices
-    are due every `NEXT_NOTICE_NS`. A measurement restarts this sequence.
+    every `NEXT_NOTICE_NS`. A measurement restarts this sequence.
 
     Args:
-        joints: Names that each joint of the arm may have in ROS messages.
+        joints: Alternative names of each joint of the arm in ROS messages.
         clock: Clock of this process.
     """
 
@@ -319,25 +315,26 @@ class _SilenceNotice:
         self._other_joints: Sequence[str] = ()
 
     def note_message(self, other_joints: Sequence[str] = ()) -> None:
-        """Records that a message of the robot has arrived, which need not be a measurement.
+        """Records that a message of the robot has arrived, whether or not it is a measurement.
 
         Args:
-            other_joints: Names of the joints in the message if none of them belongs to the arm.
+            other_joints: Names of the joints in the message, if none of them belongs to the
+                arm.
         """
         self._has_message = True
         if other_joints:
             self._other_joints = other_joints
 
     def note_measurement(self) -> None:
-        """Records that a measurement of the robot was sent to the site (arm controller).
+        """Records that a measurement of the robot was sent to the site.
 
-        The sequence of notices then starts again.
+        The sequence of notices then starts over.
         """
         self._has_measurement = True
         self._due_ns = self._clock.monotonic_ns() + FIRST_NOTICE_NS
 
     def pop(self, topic: str, site: str) -> str:
-        """Returns a notice that the robot sends no measurement. Empty if no notice is due.
+        """Returns a notice that the robot sends no measurements, or "" if no notice is due.
 
         The notice states whether the driver of the robot is silent, or sends joints with other
         names.
@@ -372,8 +369,8 @@ class RobotArm:
     the controller receives its safe command repeatedly.
 
     Args:
-        make_client: Function that connects to the present start of the site.
-        joints: Names by which the robot may call each joint, in the order of the scenario.
+        make_client: Function that connects to the current start of the site.
+        joints: Alternative names that the robot may use for each joint, in scenario order.
         robot: Settings of the robot.
         commands: Publisher of the commands to the controller.
         clock: Clock of this process.
@@ -381,10 +378,10 @@ class RobotArm:
     Attributes:
         armed: False while the robot must receive only safe commands. The bridge sets it to True
             once the scenario is known.
-        silence: Notices for the user while the robot sends no measurement.
+        silence: Notices for the user while the robot sends no measurements.
 
     Raises:
-        UsageError: The settings do not have one entry for each joint.
+        UsageError: The settings do not have one entry per joint.
     """
 
     def __init__(
@@ -416,7 +413,7 @@ class RobotArm:
         self._safe_ns = clock.monotonic_ns() - SAFE_PERIOD_NS
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Sends the joint states in a message to the site. A thread of Zenoh calls this method.
+        """Sends the joint states in a message to the site. Called in a thread of Zenoh.
 
         A message without any of the joints belongs to another robot and is ignored.
 
@@ -425,7 +422,7 @@ class RobotArm:
             attachment: Attachment of the message, which identifies the publisher.
 
         Raises:
-            ValueError: The message cannot be read, or two programs publish.
+            ValueError: The message cannot be read, or two programs publish on the topic.
         """
         self.silence.note_message()
         state = cdr.RosJoints.read(data)
@@ -451,7 +448,7 @@ class RobotArm:
     def send_command(self) -> None:
         """Sends the robot the newest torque of the site, or the safe command if it must brake.
 
-        A torque that has already been sent is not sent again.
+        A torque is sent only once.
         """
         # A site that was restarted needs another client, as a client follows one process.
         if self._client.over:
@@ -475,12 +472,12 @@ class RobotArm:
     def _may_apply(self, torque: Sequence[float]) -> bool:
         """Returns True if a torque may be passed on to the robot.
 
-        The robot must be armed, and the torque must have one entry for each joint.
+        The robot must be armed, and the torque must have one entry per joint.
         """
         return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
-        """Sends the robot a command from its settings that makes it brake or hold still."""
+        """Sends the robot the command from its settings that makes it brake or hold still."""
         self._safe_ns = self._clock.monotonic_ns()
         self._commands.put(self._pack(*self._safe_command))
 
@@ -490,21 +487,21 @@ def _order_joints(
     controller: Sequence[str],
     safe_command: Sequence[float],
 ) -> list[int]:
-    """Finds the joint of the scenario to which each joint of the controller corresponds.
+    """Finds the joint of the scenario that corresponds to each joint of the controller.
 
     A robot's controller may list its joints in an order that differs from the scenario, and may
-    have further joints.
+    have additional joints.
 
     Args:
-        joints: Names that each joint may have, in the order of the scenario.
+        joints: Alternative names of each joint, in scenario order.
         controller: Names of the joints, in the order of the controller.
-        safe_command: Command to the controller while the arm brakes.
+        safe_command: Command sent to the controller while the arm brakes.
 
     Returns:
         For each joint of the controller, its index in the scenario.
 
     Raises:
-        UsageError: The controller or the safe command does not have one entry for each joint.
+        UsageError: The controller or the safe command does not have one entry per joint.
     """
     joint_count = len(joints)
     joint_order: list[int] = []
@@ -529,12 +526,12 @@ def _order_joints(
 
 
 def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
-    """Finds the index of each joint of an arm in a message with joint states.
+    """Finds the index of each joint of an arm in a joint state message.
 
-    The message may contain further joints, and the joints may have any order.
+    The message may contain additional joints, in any order.
 
     Args:
-        joints: Names that each joint may have, in the order of the arm.
+        joints: Alternative names of each joint, in the order of the arm.
         state: The message.
 
     Returns:
@@ -568,12 +565,12 @@ def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
 
 
 def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
-    """Returns the joint angles to which a ROS program commands an arm, from its message.
+    """Extracts the commanded joint angles in rad from a ROS program's message.
 
-    The program names the joints, so their order may differ from the order in the scenario.
+    The message names the joints, so their order may differ from that in the scenario.
 
     Args:
-        joints: Names that each joint may have, in the order of the arm.
+        joints: Alternative names of each joint, in the order of the arm.
         data: The `JointState` message, encoded in CDR, the binary format of ROS 2.
 
     Returns:
@@ -588,9 +585,9 @@ def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
-    """Returns the numbers of a ROS 2 message as a list, after a check that all are finite.
+    """Returns the numbers of a ROS 2 message as a list, after checking that all are finite.
 
-    NaN or an infinite number could make a robot move without control.
+    A NaN or infinity could make a robot move uncontrollably.
 
     Raises:
         ValueError: A number is not finite.
@@ -606,14 +603,14 @@ def read_vector_target(
     count: int,
     data: bytes,
 ) -> list[float]:
-    """Returns the position or the force with which a ROS program commands an arm.
+    """Extracts the commanded position in m or force in N from a ROS program's message.
 
     The message is a `PoseStamped` for a position, and a `WrenchStamped` for a force.
 
     Args:
         frame: Name of the coordinate frame in which the arm expects the vector.
         axes: Number of coordinates to return.
-        count: Number of values in the message: 7 in a pose, 6 in a wrench.
+        count: How many numbers the message contains: 7 in a pose, 6 in a wrench.
         data: The message, encoded in CDR, the binary format of ROS 2.
 
     Returns:
@@ -635,10 +632,8 @@ def read_vector_target(
 class _Bridge:
     """Connects one running session with ROS 2.
 
-    When the object has been created, ROS programs see its topics and services. `run` then
+    Once the object has been created, ROS programs see its topics and services. `run` then
     publishes the records, events and statistics of the session.
-
-    A record is the result of one tick, a period of a site's control loop.
 
     Args:
         ends: Connections to ROS and to the session.
@@ -646,8 +641,8 @@ class _Bridge:
         epoch_unix_ns: Start of the session in Unix time, in ns.
 
     Attributes:
-        targets: Topics that command an arm, by name.
-        dominance: Topics that set the weights with which a site follows its peers, by name.
+        targets: Maps the names of topics that command an arm to the subscriptions.
+        dominance: Maps the names of topics that set dominance factors to the subscriptions.
     """
 
     def __init__(self, ends: BridgeEnds, scenario: Scenario, epoch_unix_ns: int) -> None:
@@ -700,10 +695,10 @@ class _Bridge:
         _serve_orders(graph, running, scenario.names)
 
     def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
-        """Subscribes to the topic that sets the weights with which a site follows its peers.
+        """Subscribes to the topic that sets the dominance factors of a site.
 
         Changes from before the start of the bridge are read first, because they determine the
-        present weights, which the bridge publishes.
+        current dominance factors, which the bridge publishes.
 
         Args:
             site: Name of the site.
@@ -724,9 +719,9 @@ class _Bridge:
         ends.graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance.receive)
 
     def _subscribe_target(self, site: str) -> None:
-        """Subscribes to the topic with which a ROS program moves an arm, as its operator.
+        """Subscribes to the topic on which a ROS program moves an arm, as its operator.
 
-        A person or a program in ROS can thus move an arm of the session.
+        This lets a person or a program in ROS move an arm of the session.
 
         Args:
             site: Name of the arm's site, whose scenario must allow a live hand.
@@ -760,7 +755,7 @@ class _Bridge:
             say: Function that prints a line for the user.
 
         Returns:
-            True if another session has begun under the same name.
+            True if another session with the same name has begun.
         """
         clock = self._ends.clock
         is_connected = True
@@ -793,17 +788,16 @@ class _Bridge:
         return False
 
     def _have_sites_left(self) -> bool:
-        """Returns True if sites were present and all have left. The bridge may then end."""
+        """Returns True if sites were present and all have left, so that the bridge may end."""
         return self._has_seen_site and not self._present
 
     def _publish_messages(self, rate_hz: float) -> bool:
         """Publishes the records, events and statistics that have arrived from the session.
 
-        The bridge calls this repeatedly, so that ROS programs see the newest states of the
-        arms.
+        Called repeatedly, so that ROS programs see the newest states of the arms.
 
         Returns:
-            True if another session has begun under the same name.
+            True if another session with the same name has begun.
         """
         for record in read_messages(self._records, State):
             if record.site in self._sites:
@@ -834,7 +828,7 @@ class _Bridge:
         return has_new_epoch
 
     def _publish_diagnostics(self) -> None:
-        """Publishes the state of all sites on /diagnostics, which tools of ROS display.
+        """Publishes the state of all sites on /diagnostics, which ROS tools display.
 
         No message is composed while no ROS program subscribes.
         """
@@ -860,7 +854,7 @@ def _describe_target(
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site (process that runs the arm), which must have a live operator.
+        site: Name of the site, which must have a live operator.
         hand: Connection to the site, in the role of the operator. Its method `turn` sends joint
             angles, `push` a force, and `move` a position of the end effector.
         frame: Name of the coordinate frame of the positions and forces in the messages.
@@ -869,7 +863,7 @@ def _describe_target(
         topic: Name of the topic.
         type: Name of the ROS type of its messages.
         read: Function that converts an encoded message to a target: joint angles, a force or a
-            position. It raises ValueError if the message is not valid.
+            position. Raises ValueError for an invalid message.
         send: Function that sends the target to the site.
     """
     operator = scenario.sites[site].find_live_hand(is_open=True)
@@ -893,7 +887,7 @@ def _describe_target(
 
 
 def _list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Lists the names by which ROS 2 messages may call each joint of an arm.
+    """Lists the alternative names of each joint of an arm in ROS 2 messages.
 
     Args:
         scenario: Scenario of the session.
@@ -919,16 +913,16 @@ def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str
     Args:
         graph: Connection to the ROS programs.
         running: The session.
-        sites: Names of its sites.
+        sites: Names of the sites of the session.
     """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
         """Offers a ROS 2 service that sends an order, such as "stop", to one arm or to all.
 
         Args:
-            order: Method of `RunningSession` that sends the order. The service has its name.
-            *site: Name of the site, the process that controls one arm. If it is missing, the
-                order is sent to all sites.
+            order: Method of `RunningSession` that sends the order. The service has the same
+                name.
+            *site: Name of the site. If omitted, the order is sent to all sites.
         """
         name_parts = [running.name, *site, order.__name__]
         name = "/".join(name_parts)
@@ -946,7 +940,7 @@ def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
 
     Args:
         order: Method of `RunningSession` that sends the order.
-        *sites: Names of the sites. If there are no names, the order is sent to all sites.
+        *sites: Names of the sites. If omitted, the order is sent to all sites.
 
     Returns:
         The encoded response, with the replies of the sites or the error.
@@ -967,7 +961,7 @@ def _repeat_in_thread(
 
     Args:
         period_s: Time between two calls, in s.
-        act: The function.
+        act: Function to call repeatedly.
         finish: Function that is called once after the thread has ended.
     """
     is_over = threading.Event()
@@ -998,8 +992,8 @@ def serve_ros2(
 ) -> None:
     """Runs the bridge of a session, for the command `trilat ros2`.
 
-    The function waits for a router of ROS and for the session. If another session begins under
-    the same name, the function connects to ROS again and continues with that session.
+    Waits for a ROS router and for the session. If another session with the same name begins,
+    the function reconnects to ROS and continues with that session.
 
     Args:
         running: The session.
@@ -1008,9 +1002,9 @@ def serve_ros2(
         table: Names of the topics, and settings of the robots.
         stopped: Function that returns True to end the call.
         say: Function that prints a line for the user.
-        timeout_s: Longest wait for the first site or its router, in s.
-        rviz: File for the configuration of RViz that shows the session. If `None`, no file is
-            written.
+        timeout_s: Maximum time to wait for the first site or its router, in s.
+        rviz: Path of the RViz configuration to write, with which RViz shows the session. If
+            None, no file is written.
 
     Raises:
         UsageError: There is no router, the file exists, or the settings of a robot do not fit
@@ -1062,12 +1056,12 @@ def publish_session(
         stopped: Function that is called repeatedly. The connection ends early when it returns
             True.
         say: Function that prints a line for the user.
-        rviz: File for the configuration of RViz that shows the session. If `None`, no file is
-            written.
+        rviz: Path of the RViz configuration to write, with which RViz shows the session. If
+            None, no file is written.
 
     Returns:
-        True if the session was replaced by another session of the same name, to which the
-        caller has to connect again. False if the session has ended or `stopped` returned True.
+        True if the session was replaced with another session of the same name, to which the
+        caller must reconnect. False if the session has ended or `stopped` returned True.
     """
     with ExitStack() as stack:
         robots: dict[str, RobotArm] = {}
@@ -1123,11 +1117,11 @@ def _describe_inputs(ends: BridgeEnds, bridge: _Bridge, robots: Iterable[str]) -
 
     Args:
         ends: Connections to ROS and to the session.
-        bridge: The bridge of the session, which contains the topics with targets.
+        bridge: The bridge of the session, which contains the target topics.
         robots: Names of the sites whose arm is a ROS robot.
 
     Returns:
-        A clause for each topic, such as "/session/s/robot_states measures the arm of s".
+        One clause per topic, such as "/session/s/robot_states measures the arm of s".
     """
     clauses = [f"/{topic} commands an arm" for topic in bridge.targets]
     for site in robots:
@@ -1144,7 +1138,7 @@ def _open_robot(
     say: Callable[[str], None],
     joints: JointNames = (),
 ) -> Iterator[RobotArm]:
-    """Connects the ROS robot of a site, as a context manager.
+    """Context manager that connects the ROS robot of a site.
 
     Inside the `with` block, joint states and torques are exchanged. At its end, the robot
     receives its safe command.
@@ -1154,8 +1148,8 @@ def _open_robot(
         site: Name of the site whose arm is the robot.
         robot: Settings of the robot.
         say: Function that prints a line for the user.
-        joints: Names that each joint may have, in the order of the scenario. If empty, the
-            names in the settings are used.
+        joints: Alternative names of each joint, in scenario order. If empty, the names in the
+            settings are used.
 
     Yields:
         The robot.
@@ -1173,7 +1167,7 @@ def _open_robot(
     ends.graph.subscribe(states_topic, cdr.JOINT_STATE, arm.receive)
 
     def report_silence() -> None:
-        """Tells the user that the robot sends no measurements, if such a notice is due."""
+        """Prints a notice that the robot sends no measurements, if such a notice is due."""
         notice = arm.silence.pop(f"/{states_topic}", site)
         if notice:
             say(notice)
@@ -1193,11 +1187,11 @@ def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool)
     Args:
         ends: Connections to ROS and to the session.
         stopped: Function that returns True to end the wait.
-        running: True to wait until a site runs. If False, a site that still waits for others is
-            accepted.
+        running: True to wait until a site is running. If False, a site that is still waiting
+            for others is accepted.
 
     Returns:
-        The identity of the site. `None` if `stopped` returned True.
+        The identity of the site, or None if `stopped` returned True.
     """
     members = SessionMembers(ends.bus, ends.clock, ends.session)
     for info in members.find(stopped=stopped, timeout_s=None):

@@ -1,7 +1,6 @@
 """The command `trilat ros2`, which connects a running session with ROS 2 programs.
 
-The command parses its options, connects to both networks, and starts the bridge in
-`ros2_bridge`.
+Parses the options, connects to both networks, and starts the bridge in `ros2_bridge`.
 """
 
 from pathlib import Path
@@ -37,12 +36,12 @@ def ros2_command(
 ) -> None:
     """Connects a session to ROS 2.
 
-    ROS programs can hold arms, and ROS robots whose controllers take joint torques can serve as
-    arms. ROS must use RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must run. This
-    machine needs no ROS installation. The bridge waits for the router of ROS without a limit,
-    and for the session for the time of --timeout. It ends with the session. It was tested
-    against programs that speak the protocol of rmw_zenoh, but not with ROS itself and not with
-    a robot. docs/reference/ros2-topics.md lists all topics and services.
+    ROS programs can hold arms, and ROS robots whose controllers accept joint torques can serve
+    as arms. ROS must use RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must be
+    running. This machine needs no ROS installation. The bridge waits indefinitely for the ROS
+    router, and up to the time given by --timeout for the session. It ends with the session. It
+    has been tested against programs that speak the rmw_zenoh protocol, but not with ROS itself
+    and not with a robot. docs/reference/ros2-topics.md lists all topics and services.
 
     Options:
         distro: ROS 2 distribution whose message format the bridge writes.
@@ -68,10 +67,10 @@ def ros2_command(
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:
-        """Joins the network of ROS 2 as a node called trilat, in the session's namespace.
+        """Joins the ROS 2 network as a node called trilat, in the session's namespace.
 
         Args:
-            refusals: Counts the messages of ROS programs that the bridge refuses.
+            refusals: Counts the messages of ROS programs that the bridge rejects.
         """
         return Ros2Graph(
             refusals=refusals,

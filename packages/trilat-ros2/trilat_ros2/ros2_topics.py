@@ -1,14 +1,13 @@
 """Publishes the states of a session's sites as ROS 2 topics.
 
-A site is a process that runs one arm. Its joint states, poses, torques and statistics become
-standard ROS messages on topics below `/<session>/<site>`, and the poses of its links become
-part of `/tf`.
+The joint states, poses, torques and statistics of a site become standard ROS messages on topics
+below `/<session>/<site>`, and the poses of its links become part of `/tf`.
 
 Invariant:
     - A message is composed only while a ROS program subscribes to its topic, because composing
       it takes time.
     - The names of the topics (`topic_names`) and the content of the messages (`published`) are
-      the same as in a ROS bag that is exported from a log.
+      the same as in a ROS bag exported from a log.
 """
 
 from pathlib import Path
@@ -25,18 +24,18 @@ from trilat_net.scenario import Scenario
 RELIABLE = QualityOfService()
 """Quality of service of most topics."""
 LATCHED = QualityOfService(latched=True, depth=1)
-"""Quality of service of topics whose last message late subscribers receive."""
+"""Quality of service of topics that send their last message to late subscribers."""
 
 
 class BridgeEnds(NamedTuple):
-    """The two networks that a bridge connects: the network of ROS 2 and that of the session.
+    """The two networks that a bridge connects: the ROS 2 network and that of the session.
 
     Attributes:
         graph: Connection to the ROS programs.
         bus: Network connection to the session.
         clock: Clock of this process.
         session: Name of the session.
-        table: Names of the ROS topics, as the user has configured them.
+        table: Names of the ROS topics, as configured by the user.
     """
 
     graph: Ros2Graph
@@ -46,7 +45,7 @@ class BridgeEnds(NamedTuple):
     table: TopicTable
 
     def topic(self, site: str, name: str) -> str:
-        """Returns the full ROS 2 topic name of a quantity of an arm, in the user's scheme.
+        """Returns the full ROS 2 name of an arm's topic, in the user's naming scheme.
 
         Args:
             site: Name of the site.
@@ -55,11 +54,11 @@ class BridgeEnds(NamedTuple):
         return self.table.find(self.session, site, name)
 
     def write_rviz_config(self, scenario: Scenario, path: Path) -> None:
-        """Writes a file of settings with which the viewer RViz shows the arms of the session.
+        """Writes a configuration with which the viewer RViz shows the arms of the session.
 
         Args:
             scenario: Scenario of the session.
-            path: File of the configuration. A file of an earlier session is replaced.
+            path: Path of the configuration. A file from an earlier session is replaced.
 
         Raises:
             UsageError: The file cannot be written.
@@ -69,21 +68,20 @@ class BridgeEnds(NamedTuple):
 
 
 class SiteTopics:
-    """Publishes the state of one arm on ROS 2 topics, if a program subscribes to them.
+    """Publishes the state of one arm on those ROS 2 topics that have subscribers.
 
     Args:
         ends: Connections to ROS and to the session.
         scenario: Scenario of the session.
         site: Name of the site.
-        epoch_unix_ns: Start of the session in Unix time, in ns. Time stamps are counted from
-            it.
-        frames: Publisher of `/tf`, which all sites share.
+        epoch_unix_ns: Start of the session in Unix time, in ns, from which time stamps are
+            counted.
+        frames: Publisher of `/tf`, shared by all sites.
 
     Attributes:
         frame: Name of the frame of the site's end effector.
-        shares: Weights with which the site follows its peers (the other sites), over time.
-        newest: Record (result of one tick of the site) that was published last. `None` before
-            the first record.
+        shares: Dominance factors of the site over time.
+        newest: The last published record, or None before the first one.
     """
 
     def __init__(
@@ -114,11 +112,11 @@ class SiteTopics:
         """Publishes a record on all topics that have subscribers.
 
         A record is ignored if it is older than the last published record of the same process of
-        the site, or if it would exceed the rate.
+        the site, or if publishing it would exceed the rate.
 
         Args:
-            record: Result of one tick of the site.
-            rate_hz: Largest number of records that are published per second of the session.
+            record: Record of the site.
+            rate_hz: Maximum number of records to publish per second of the session.
         """
         newest = self.newest
         # At most one record is published in each period of the rate.

@@ -1,10 +1,10 @@
 """Loads eight bytes from an array as one integer, in compiled code.
 
-Compiled code thus compares and copies encoded messages eight bytes at a time, instead of byte
+This lets compiled code compare and copy encoded messages eight bytes at a time instead of byte
 by byte.
 
 Invariant:
-    - The caller makes sure that the eight bytes lie within the array.
+    - The caller ensures that the eight bytes lie within the array.
     - All integers are signed, because Numba converts a sum of signed and unsigned numbers to a
       floating-point number.
 """
@@ -23,7 +23,7 @@ _SIGN = 1 << 63
 
 
 def _generate_load(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-    """Generates the code that loads eight bytes at any offset of an array of bytes."""
+    """Generates the code that loads eight bytes at any offset of a byte array."""
     data, offset = args
     array = context.make_array(signature.args[0])(context, builder, data)
     pointer = builder.gep(array.data, [offset])
@@ -51,7 +51,7 @@ def _load_swapped(_context: Any, data: Any, _place: Any) -> Any:
 def _copy_compiled(
     _context: Any, source: Any, _place: Any, target: Any, _first: Any, _length: Any
 ) -> Any:
-    """Generates the machine code that copies some bytes from one array to another.
+    """Generates the machine code that copies bytes from one array to another.
 
     Numba calls this function when it compiles a call of `copy_bytes`. A block copy is faster
     than a compiled loop over the bytes.
@@ -71,12 +71,12 @@ def _copy_compiled(
 
 
 def _copy_plain(source: Any, offset: int, target: Any, first: int, length: int) -> None:
-    """Copies some bytes if Numba is disabled."""
+    """Copies bytes when Numba is disabled."""
     target[first : first + length] = source[offset : offset + length]
 
 
 def _load_plain(data: Any, offset: int, byte_order: Any) -> int:
-    """Loads a word if Numba is disabled."""
+    """Loads a word when Numba is disabled."""
     word = int.from_bytes(bytes(data[offset : offset + _WORD_BYTES]), byte_order)
     return (word ^ _SIGN) - _SIGN  # the same bits as a signed number
 

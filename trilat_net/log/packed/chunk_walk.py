@@ -1,12 +1,12 @@
-"""Finds all messages in an unpacked chunk of an MCAP file, in one pass of compiled code.
+"""Finds all messages in an uncompressed chunk of an MCAP file, in one pass of compiled code.
 
-A chunk is a block of a log that is compressed as a whole, and contains hundreds of messages of
-all channels. `walk_messages` finds where each message lies, and `copy_payloads` collects the
-messages of each channel.
+A chunk is a block of a log that is compressed as a unit and contains hundreds of messages of
+all channels. `walk_messages` locates the messages, and `copy_payloads` collects those of one
+channel.
 
 Invariant:
     - The pass stops at any record that is neither a complete message of a known channel nor a
-      record that a reader ignores. The caller reads the rest record by record.
+      record that readers ignore. The caller reads the rest record by record.
 """
 
 from typing import Any, NamedTuple
@@ -26,9 +26,9 @@ _LOG_TIME = 6
 _PUBLISH_TIME = _LOG_TIME + 8
 
 CAPACITY = 1 << 13
-"""Largest number of messages that one walk finds."""
+"""Maximum number of messages found in one walk."""
 MOST_CHANNELS = 1 << 16
-"""Number of channels that the head of a message can state."""
+"""Number of different channels that the header of a message can represent."""
 
 WALKED = 0
 """The walk ended at the end of the chunk, or after `CAPACITY` messages."""
@@ -39,21 +39,22 @@ AT_UNKNOWN = 2
 
 
 class MessageRun(NamedTuple):
-    """The messages that one pass over a chunk found, and counts for each channel.
+    """The messages found in one pass over an uncompressed chunk, with totals per channel.
 
-    A chunk is an unpacked block of messages. A slot is a small number that stands for a
-    channel. The arrays have one entry per message, or one entry per slot.
+    Channels are represented by small integers, called slots. Each array has one entry per
+    message or one entry per slot.
 
     Attributes:
         slots: Slot of each message's channel.
-        begins: Offset of the payload's first byte in the chunk.
-        ends: Offset after its last byte.
-        log_ns: Time of arrival at the recorder, in Unix time, in ns, as a signed number.
-        publish_ns: Time of sending, in the same format.
+        begins: Offset in the chunk of the first byte of each payload.
+        ends: Offset in the chunk after the last byte of each payload.
+        log_ns: Arrival time of each message at the recorder in Unix time, in ns, as a signed
+            integer.
+        publish_ns: Sending time of each message, in the same format.
         counts: Number of messages, per slot.
-        lengths: Sum of the lengths of the messages with their heads, per slot, in bytes.
-        excess: Sum of the lengths beyond a limit, per slot, in bytes.
-        firsts: Index of the first message, per slot with messages.
+        lengths: Total length of the messages including their headers, per slot, in bytes.
+        excess: Total of the lengths beyond a limit, per slot, in bytes.
+        firsts: Index of the first message, for each slot with messages.
     """
 
     slots: NDArray[np.int32]
@@ -68,11 +69,11 @@ class MessageRun(NamedTuple):
 
     @classmethod
     def allocate(cls, slots: int, messages: int = 1) -> "MessageRun":
-        """Returns empty arrays that receive the messages of one call of `walk_messages`.
+        """Allocates empty arrays for the messages found in one call of `walk_messages`.
 
         Args:
-            slots: Number of slots, the small numbers that stand for channels.
-            messages: Largest number of messages.
+            slots: Number of slots (small integers that represent the channels).
+            messages: Maximum number of messages.
         """
         places = [np.zeros(messages, np.int64) for _ in range(4)]
         sums = [np.zeros(slots, np.int64) for _ in range(4)]
@@ -83,21 +84,22 @@ class MessageRun(NamedTuple):
 def walk_messages(
     data: Bytes, offset: int, slot_of_channel: NDArray[np.int32], long_bytes: int, run: Any
 ) -> tuple[int, int, int]:
-    """Finds the messages in an unpacked chunk (block of messages), beginning at an offset.
+    """Finds the messages in an uncompressed chunk, starting at a given offset.
 
-    This compiled code stops at the first record that is neither a message of a known channel
-    nor a record to ignore, and after `CAPACITY` messages.
+    This compiled function stops at the first record that is neither a message of a known
+    channel nor a record to ignore, and after `CAPACITY` messages.
 
     Args:
-        data: The unpacked chunk.
+        data: The uncompressed chunk.
         offset: Offset of the first record to read.
-        slot_of_channel: Slot of each channel, by its number. -1 for an unknown channel.
+        slot_of_channel: Slot of each channel, indexed by channel number; -1 for an unknown
+            channel.
         long_bytes: Length beyond which the bytes of a message count as excess.
-        run: `MessageRun` that receives the messages. Its sums are increased.
+        run: `MessageRun` in which the messages are stored. Its totals are increased.
 
     Returns:
         The number of messages, the offset of the next record, and the reason for stopping:
-        `WALKED`, `AT_DEFINITION` or `AT_UNKNOWN`.
+            `WALKED`, `AT_DEFINITION` or `AT_UNKNOWN`.
     """
     size = data.shape[0]
     count = 0
@@ -144,19 +146,19 @@ def copy_payloads(
     ends: Ints,
     times: Ints,
 ) -> None:
-    """Collects the payloads of one channel from a chunk, one after another.
+    """Copies the payloads of one channel out of a chunk, one after another.
 
-    A chunk contains messages of all channels in the order of their arrival.
+    A chunk contains the messages of all channels, in order of arrival.
 
     Args:
-        data: The unpacked chunk.
-        count: Number of messages that `walk_messages` found.
-        slot: Small number that stands for the channel.
-        run: The messages that `walk_messages` found, a `MessageRun`.
-        payloads: Receives the payloads one after another.
-        offset: Offset in `payloads` at which the first payload begins.
-        ends: Receives the offset after each payload in `payloads`, shape (messages,).
-        times: Receives the times of arrival and of sending, shape (2, messages).
+        data: The uncompressed chunk.
+        count: Number of messages found by `walk_messages`.
+        slot: Small integer that represents the channel.
+        run: The `MessageRun` filled by `walk_messages`.
+        payloads: Output array for the payloads, stored one after another.
+        offset: Offset in `payloads` of the first payload.
+        ends: Output array for the offset in `payloads` after each payload, shape (messages,).
+        times: Output array for the arrival and sending times, shape (2, messages).
     """
     number = 0
     for n in range(count):

@@ -1,12 +1,11 @@
-"""Reads the fields of many records of an arm as arrays, without decoding records one by one.
+"""Reads fields of many records of an arm as arrays, without decoding the records one by one.
 
-A record is the message with the state of an arm in one period of its control loop. Compiled
-code finds the offset of each field in the encoded records once. Then, for example, the ticks of
-all records are read directly from the bytes.
+Compiled code locates each field in the encoded records once. The ticks of all records, for
+example, can then be read directly from the bytes.
 
 Invariant:
     - All records have the exact layout that this program writes. Otherwise there is no
-      `IndexedRecords`, and the records are decoded by `record_columns`.
+      `IndexedRecords`, and `record_columns` decodes the records instead.
     - The arrays equal those of `record_columns`, bit for bit.
 """
 
@@ -29,20 +28,22 @@ _INTS = {
     "busy_us": (record_scan.LATE, (BEFORE_BUSY,)),
     "sent_ns": (record_scan.LATE, (BEFORE_BUSY, BEFORE_SENT)),
 }
-"""Integer fields: the mark before a field, and the literals between the mark and the field."""
+"""For each integer field, the mark before the field, and the literals between the mark and the
+field.
+"""
 _TICK, _BOOT, _MODE = range(3)
-"""Columns of the heads, see `record_scan.scan_records`."""
+"""Columns of the array `heads`, see `record_scan.scan_records`."""
 
 
 class IndexedRecords:
-    """Fields of K records of an arm, which compiled code reads directly from the encoded bytes.
+    """Fields of K records of an arm, read directly from the encoded bytes by compiled code.
 
-    All records have the layout that this program writes. `IndexedRecords.of_payloads` creates
-    this object.
+    All records have the layout that this program writes. Created by
+    `IndexedRecords.of_payloads`.
 
     Args:
         messages: The encoded records.
-        peers: Names of the site's peers (other sites).
+        peers: Names of the site's peers.
         layout: Lengths of the vectors of a record.
         exact: The constant bytes between the values of a record.
         heads: Tick, boot and mode of each record, shape (K, 3).
@@ -63,7 +64,7 @@ class IndexedRecords:
         marks: NDArray[np.int32],
         counts: NDArray[np.int32],
     ) -> None:
-        """Stores encoded records, with the positions of their values from `of_payloads`."""
+        """Stores encoded records, with the positions of their values found by `of_payloads`."""
         self.messages = messages
         self._peers = peers
         self._layout = layout
@@ -76,7 +77,7 @@ class IndexedRecords:
         return len(self.messages)
 
     def select(self, rows: Ints | slice) -> "IndexedRecords":
-        """Returns some of the records, or all of them in another order, without decoding them.
+        """Returns a selection of the records, in any order, without decoding them.
 
         Args:
             rows: Indices of the records, or a slice.
@@ -93,33 +94,33 @@ class IndexedRecords:
 
     @property
     def ticks(self) -> Ints:
-        """Number of the control period (tick) of each of the K records, shape (K,)."""
+        """Tick number of each of the K records, shape (K,)."""
         return np.ascontiguousarray(self._heads[:, _TICK])
 
     @property
     def boots(self) -> Ints:
-        """Random number that identifies the start of the process in each record, shape (K,).
+        """Random number in each record that identifies the start of the process, shape (K,).
 
-        A restarted process has another number. The number is unsigned with 64 bits, but is
-        returned as the signed number with the same bits.
+        A restarted process has another number. It is an unsigned 64-bit integer, returned as
+        the signed integer with the same bits.
         """
         return self._heads[:, _BOOT]
 
     @property
     def mode_codes(self) -> Ints:
-        """Code of the controller's operating mode in each record, shape (K,), see `Mode`."""
+        """Code of the site's mode in each record, shape (K,), see `Mode`."""
         return self._heads[:, _MODE]
 
     @property
     def modes(self) -> NDArray[np.object_]:
-        """Name of the controller's operating mode in each record, such as "run", shape (K,)."""
+        """Name of the site's mode in each record, such as "run", shape (K,)."""
         bits = np.empty(max(map(int, MODE_WORDS)) + 1, np.object_)
         for mode, word in MODE_WORDS.items():
             bits[int(mode)] = word
         return bits[self.mode_codes]
 
     def ints(self, field: str) -> Ints:
-        """Returns one integer field of all K records as an array of the shape (K,).
+        """Returns an integer field of all K records as an array of shape (K,).
 
         Args:
             field: Name of the field, one of `_INTS`.
@@ -129,11 +130,11 @@ class IndexedRecords:
         return np.ascontiguousarray(self._gather_ints(mark, gaps)[:, -1])
 
     def has_ints(self, field: str) -> bool:
-        """True if the records have an integer field of this name, which `ints` can read."""
+        """Returns True if `ints` can read an integer field of this name from the records."""
         return field in _INTS
 
     def _gather_ints(self, mark: int, gaps: Sequence[int]) -> Ints:
-        """Reads integers at known distances behind a position in each encoded record.
+        """Reads integers at known distances after a position in each encoded record.
 
         The result has the shape (K, number of gaps). A gap is the number of bytes before an
         integer.
@@ -150,23 +151,21 @@ class IndexedRecords:
 
     @property
     def used(self) -> Ints:
-        """Which received state of each peer the control law used in each record, shape (K, P).
+        """Tick of the sample of each peer that the control law used in each record.
 
-        A peer is another arm controller (site), which sends a state (sample) in each tick
-        (control period). The number of that tick is given for each of P peers, or -1 before the
-        first sample.
+        Shape (K, P) for P peers. The tick is -1 before the first sample of a peer.
         """
         peers = self._exact.peers
         lengths = self._exact.lengths
         return self._gather_ints(record_scan.USED, lengths[len(lengths) - peers :].tolist())
 
     def vector_words(self, fields: Sequence[str]) -> Ints:
-        """Returns some vectors of all K records as bits, to compare records bit by bit.
+        """Returns vectors of all K records as bit patterns, for exact comparison of records.
 
-        The shape is (K, numbers). Equal bits mean equal numbers, also for NaN and signed zeros.
-        Compiled code reads the numbers at fixed distances after a known position (mark) in each
-        encoded record. A record has two such positions, so the numbers are read in up to two
-        groups.
+        The shape is (K, total number of entries). Equal bits mean equal values, even for NaN
+        and signed zeros. Compiled code reads the entries at fixed offsets from a known position
+        (mark) in each encoded record. A record has two such positions, so the entries are read
+        in up to two groups.
 
         Args:
             fields: Names of the vectors. The records must have all of them.
@@ -196,7 +195,7 @@ class IndexedRecords:
         return bits
 
     def _gather_floats(self, mark: int, places: Sequence[int]) -> Ints:
-        """Reads the bits of floats at fixed distances behind a position in each encoded record.
+        """Reads the bits of floats at fixed distances after a position in each encoded record.
 
         The result has the shape (K, number of distances).
         """
@@ -211,11 +210,11 @@ class IndexedRecords:
         return bits
 
     def _vector_places(self) -> dict[str, tuple[int, int, int]]:
-        """Returns where the vectors, such as joint angles, lie in an encoded record, by name.
+        """Locates the vectors, such as joint angles, in an encoded record.
 
         Returns:
-            For each vector: the column of `marks` with the position from which its offset
-            counts, the offset of its first number in bytes, and its length in numbers.
+            Maps each vector to the column of `marks` with the position from which its offset is
+            counted, the offset of its first entry in bytes, and its number of entries.
         """
         exact = self._exact
         names = list(self._layout.lengths())
@@ -234,13 +233,13 @@ class IndexedRecords:
         return places
 
     def vectors(self, fields: Sequence[str]) -> dict[str, Array]:
-        """Reads some vectors, such as joint angles, from all encoded records.
+        """Reads vectors, such as joint angles, from all encoded records.
 
         Args:
             fields: Names of the vectors.
 
         Returns:
-            For each field an array of shape (K, length). The length is 0 for a field that
+            Maps each field to an array of shape (K, length). The length is 0 for a field that
             these records do not have.
         """
         lengths = self._layout.lengths()
@@ -254,10 +253,10 @@ class IndexedRecords:
 
     @property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """Which samples (states of other sites) arrived in each tick (control period).
+        """Samples that arrived from the peers in each tick.
 
-        The first array has the number of arrivals of each record, shape (K,). The second one
-        has all N arrivals in order: sender, tick of the sample and delay in us, shape (N, 3).
+        The first array contains the number of arrivals in each record, shape (K,). The second
+        lists all N arrivals in order: sender, tick of the sample and delay in us, shape (N, 3).
         """
         counts = self._counts[:, record_scan.ARRIVAL_COUNT].astype(np.int64)
         numbers = np.zeros((int(counts.sum()), 3), np.int64)
@@ -272,18 +271,18 @@ class IndexedRecords:
 
     @property
     def change_counts(self) -> NDArray[np.int32]:
-        """Number of changes of settings that each record contains, shape (K,).
+        """Number of parameter changes that each record contains, shape (K,).
 
-        The changes are the strings of the field `cmd`. Most records contain no changes.
+        The changes are the strings in the field `cmd`. Most records contain none.
         """
         return self._counts[:, record_scan.CHANGE_COUNT]
 
     @property
     def memory_words(self) -> tuple[Ints, Ints]:
-        """Internal state of the control law (field `mem`) in each record.
+        """Internal state of the control law (field `mem`) in each record, as bit patterns.
 
-        The first array has the count of numbers of each record, shape (K,). The second one has
-        the bits of the numbers of all records, one after another.
+        The first array contains the length of the state vector in each record, shape (K,). The
+        second contains the bits of the entries of all records, one after another.
         """
         counts = self._counts[:, record_scan.MEMORY_COUNT].astype(np.int64)
         bits = np.zeros(int(counts.sum()), np.int64)
@@ -298,9 +297,9 @@ class IndexedRecords:
 
     @property
     def memories(self) -> NDArray[np.object_]:
-        """Internal state of the control law in each record, as lists of numbers, shape (K,).
+        """Internal state of the control law in each record, as a list of numbers, shape (K,).
 
-        It is the field `mem` of a record, which a simulation needs to continue from the record.
+        This is the field `mem` of a record. A simulation needs it to continue from the record.
         """
         counts, bits = self.memory_words
         numbers = bits.view(np.float64).tolist()
@@ -315,18 +314,18 @@ class IndexedRecords:
     def of_payloads(
         cls, payloads: PackedMessages, site: str, peers: Sequence[str], layout: Layout
     ) -> "IndexedRecords | None":
-        """Prepares records for reading their fields without decoding them one by one.
+        """Locates the fields in records, so that they can be read without decoding the records.
 
-        This is possible only if all of them have the exact layout that this program writes.
+        Works only if all records have the exact layout that this program writes.
 
         Args:
             payloads: The encoded records.
             site: Name of the site that sent them.
-            peers: Names of its peers, in the order of the scenario.
+            peers: Names of its peers, in scenario order.
             layout: Lengths of the vectors of a record.
 
         Returns:
-            The records. None if a record has another layout, or is not valid.
+            The records, or None if a record has another layout or is invalid.
         """
         exact = RecordLayout.of_site(site, peers, layout)
         count = len(payloads)

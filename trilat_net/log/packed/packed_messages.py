@@ -1,7 +1,7 @@
 """Stores the encoded messages of a channel one after another in one block of bytes.
 
-Compiled code can read the block without creating a Python object for each message. For all
-other code it behaves like a list of `bytes`.
+Compiled code can read the block without creating a Python object per message. To all other code
+it behaves like a list of `bytes`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,13 +14,13 @@ Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 PADDING = 16
-"""Number of bytes after the last message, so that eight bytes can be loaded at every offset of
-a message, and after the head of a number at its end.
+"""Number of bytes after the last message. They make it possible to load eight bytes at any
+offset of a message, and after the header of a number at its end.
 """
 
 
 class PackedMessages(Sequence[bytes]):
-    """List of encoded messages that are stored in one block of bytes, and cannot be changed.
+    """Immutable list of encoded messages, stored in one block of bytes.
 
     A message becomes a `bytes` object only when it is accessed, because thousands of objects
     would take much memory and time.
@@ -32,8 +32,8 @@ class PackedMessages(Sequence[bytes]):
 
     Attributes:
         data: The bytes of all messages.
-        starts: See above.
-        ends: See above.
+        starts: See Args.
+        ends: See Args.
     """
 
     def __init__(self, data: Bytes, starts: Ints, ends: Ints) -> None:
@@ -45,7 +45,7 @@ class PackedMessages(Sequence[bytes]):
 
     @classmethod
     def pack(cls, payloads: Sequence[bytes]) -> "PackedMessages":
-        """Stores encoded messages in one block of bytes, which needs little memory.
+        """Packs encoded messages into one block of bytes to save memory.
 
         Args:
             payloads: The encoded messages. Packed messages are returned unchanged.
@@ -59,10 +59,10 @@ class PackedMessages(Sequence[bytes]):
         return cls(data, starts, ends)
 
     def select(self, rows: Ints | slice) -> "PackedMessages":
-        """Returns some of the messages, in any order, without copying their bytes.
+        """Returns a selection of the messages, in any order, without copying their bytes.
 
         Args:
-            rows: Index of each message in this sequence, or a slice.
+            rows: Indices of the messages in this sequence, or a slice.
         """
         return PackedMessages(self.data, self.starts[rows], self.ends[rows])
 

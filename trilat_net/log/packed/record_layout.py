@@ -1,9 +1,9 @@
-"""Describes the exact bytes of a record as this program writes it, for compiled code.
+"""Describes, for compiled code, the exact bytes of a record as this program writes it.
 
-A record is the encoded state of an arm in one period of its control loop
-(`net.wire.encode_state`). Its fields have a fixed order, and the bytes between two values are
-always the same, such as the name of the next field. These constant bytes are called literals.
-By comparing them, `record_scan` recognises a record without a general decoder.
+A record is encoded by `net.wire.encode_state`. Its fields have a fixed order, and the bytes
+between two values (such as the name of the next field) are always the same. These constant
+bytes are called literals. By comparing them, `record_scan` recognises a record without a
+general decoder.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,10 @@ from .packed_messages import Ints
 _encode = msgspec.msgpack.Encoder().encode
 _WORD_BYTES = 8
 _FIRST_FIELDS = 22
-"""Number of fields of a record without the optional vectors."""
+"""Number of fields of a record, excluding the optional vectors."""
 _OPTIONAL_VECTORS = ("x", "xd", "wrench", "ch", "hand", "bodies")
 NUMBER_BYTES = 9
-"""Length of an encoded floating-point number."""
+"""Length of an encoded floating-point number, in bytes."""
 
 # Indices of the literals before single values. Those of vectors and peers follow.
 BEFORE_BOOT, BEFORE_TICK, BEFORE_TIME, BEFORE_MODE, BEFORE_USED, BEFORE_ARRIVALS = range(6)
@@ -33,21 +33,22 @@ BEFORE_BUSY, BEFORE_SENT, BEFORE_ECHO, FIRST_VECTOR = range(10, 14)
 class RecordLayout(NamedTuple):
     """The constant bytes (literals) between the values of a record, and its vector lengths.
 
-    Compiled code compares a record with them. Each literal is stored as words of eight bytes.
-    Only the bytes that the mask of a word selects are part of the literal.
+    Compiled code compares records with the literals. Each literal is stored as words of eight
+    bytes. Only the bytes selected by the mask of a word belong to the literal.
 
     Attributes:
         bits: Words of all literals, shape (W,).
         masks: Masks of the words, shape (W,).
-        first_words: Index of the first word of each of the L literals, and W, shape (L + 1,).
+        first_words: Index of the first word of each of the L literals, followed by W, shape (L
+            + 1,).
         lengths: Length of each literal in bytes, shape (L,).
-        vectors: Length of each vector in front of the field `used`, shape (V,). Vector n
-            follows literal `FIRST_VECTOR` + n.
+        vectors: Length of each vector before the field `used`, shape (V,). Vector n follows
+            literal `FIRST_VECTOR` + n.
         optional_vectors: Length of each vector after the field `echo`, shape (O,). Their
             literals follow those of the other vectors.
-        peers: Number of peers (other sites). Their literals come last.
+        peers: Number of peers. Their literals come last.
         modes: Words of the names of the modes, shape (M, 2): the name, and its mask.
-        mode_codes: Number of each mode, shape (M,).
+        mode_codes: Code of each mode, shape (M,).
     """
 
     bits: Ints
@@ -68,7 +69,7 @@ class RecordLayout(NamedTuple):
 
         Args:
             site: Name of the site.
-            peers: Names of its peers, in the order of the scenario.
+            peers: Names of its peers, in scenario order.
             layout: Lengths of the vectors of a record.
         """
         lengths = layout.lengths()
@@ -114,12 +115,12 @@ class RecordLayout(NamedTuple):
 
 
 def _array_head(length: int) -> bytes:
-    """Returns the bytes with which an encoded list (MessagePack) of a given length begins."""
+    """Returns the first bytes of an encoded list (MessagePack) of a given length."""
     return _encode([None] * length)[:-length] if length else _encode([])
 
 
 def _map_head(length: int) -> bytes:
-    """Returns the bytes with which an encoded map (MessagePack) of a given length begins."""
+    """Returns the first bytes of an encoded map (MessagePack) of a given length."""
     pair_bytes = len(_encode("00")) + len(_encode(None))
     encoded = _encode({f"{n:02}": None for n in range(length)})
     return encoded[: len(encoded) - length * pair_bytes]

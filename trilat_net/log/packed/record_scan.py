@@ -1,12 +1,11 @@
 """Checks whether encoded records have the exact layout, and finds where their values lie.
 
-A record is the encoded state of an arm in one period of its control loop. Once the offsets of
-the values are known, a field of all records can be read directly from the bytes
-(`indexed_records`).
+Once the offsets of the values are known, a field of all records can be read directly from the
+bytes (`indexed_records`).
 
 Invariant:
-    - A record is accepted only if the decoder of whole records also accepts it, with the same
-      values.
+    - A record is accepted only if the decoder for complete records accepts it too, with the
+      same values.
     - A record with another order of fields, another version, or an unusual value is not
       accepted, even if it is valid.
 """
@@ -42,18 +41,18 @@ from .record_layout import (
 # Columns of the marks of a record: the offset of a value from the first byte of the record.
 TIME, VECTORS, USED, ARRIVALS, CRC, MEMORY, LATE, OPTIONAL = range(8)
 MARKS = 8
-"""Number of the marks of a record."""
+"""Number of marks per record."""
 # Columns of the counts of a record.
 ARRIVAL_COUNT, CHANGE_COUNT, MEMORY_COUNT = range(3)
 COUNTS = 3
-"""Number of the counts of a record."""
+"""Number of counts per record."""
 
 _NOT_ACCEPTED = -1
 _MOST_TICKS = 1 << 40
 _MOST_INSTANT = 1 << 59
 _MOST_MEMORY = MAX_JOINTS + 1 + MAX_LAW_MEMORY
 _EXPONENT = 0x7FF << 52
-"""Bits of a floating-point number that are all set if the number is not finite."""
+"""Bits of a floating-point number that are all set if it is infinite or NaN."""
 _FLOAT = 0xCB
 _SHORT_MAP, _SHORT_LIST, _SHORT_TEXT, _FIRST_WORD = 0x80, 0x90, 0xA0, 0xC0
 _TEXT_8, _TEXT_16, _LIST_16, _LIST_32 = 0xD9, 0xDA, 0xDC, 0xDD
@@ -61,7 +60,10 @@ _UNSIGNED, _SIGNED, _NEGATIVE = 0xCC, 0xD0, 0xE0
 
 
 def _list_sizes() -> NDArray[np.int64]:
-    """Returns the length of an encoded integer by its first byte. 0 for other bytes."""
+    """Returns the length of an encoded integer for each value of its first byte.
+
+    0 for values with which no integer begins.
+    """
     sizes = np.zeros(256, np.int64)
     sizes[:_SHORT_MAP] = 1
     sizes[_NEGATIVE:] = 1
@@ -78,8 +80,8 @@ _SIZES = _list_sizes()
 def _read_int(data: Bytes, offset: int) -> int:
     """Decodes the integer that begins at an offset, in the binary format MessagePack.
 
-    The result is a signed number of 64 bits. An unsigned number of 2^63 or more becomes the
-    negative number with the same bits.
+    The result is a signed 64-bit integer. An unsigned integer of 2^63 or more becomes the
+    negative integer with the same bits.
     """
     first = int(data[offset])
     if first < _SHORT_MAP:  # a small number, which is its own code
@@ -100,8 +102,8 @@ def _read_int(data: Bytes, offset: int) -> int:
 def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
     """Returns the offset after constant bytes that every encoded record has at this point.
 
-    The result is -1 if the record has other bytes there. The record must then be decoded in
-    another way.
+    Returns -1 if the record has other bytes there. The record must then be decoded in another
+    way.
     """
     after: int = offset + layout.lengths[literal]
     if after > end:
@@ -116,7 +118,7 @@ def _after_literal(data: Bytes, offset: int, end: int, literal: int, layout: Any
 
 @leaf
 def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) -> int:
-    """Returns the offset of an integer in an encoded record, after constant bytes.
+    """Returns the offset of an integer that follows constant bytes in an encoded record.
 
     Args:
         data: The records.
@@ -126,7 +128,7 @@ def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) ->
         layout: The exact layout of the records, a `RecordLayout`.
 
     Returns:
-        The offset. -1 if the record has other bytes there, or no complete integer.
+        The offset, or -1 if the record has other bytes there, or no complete integer.
     """
     offset = _after_literal(data, offset, end, literal, layout)
     if offset < 0 or offset >= end:
@@ -142,7 +144,7 @@ def _int_after(data: Bytes, offset: int, end: int, literal: int, layout: Any) ->
 
 @leaf
 def _list_count(data: Bytes, offset: int, end: int) -> int:
-    """Returns the number of items of the list that begins at an offset. -1 if there is none."""
+    """Returns the length of the list that begins at an offset, or -1 if there is none."""
     if offset < 0 or offset >= end:
         return _NOT_ACCEPTED
     first = int(data[offset])
@@ -155,13 +157,13 @@ def _list_count(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _list_head_bytes(data: Bytes, offset: int) -> int:
-    """Returns the length in bytes of the head of the list that begins at an offset."""
+    """Returns the size in bytes of the header of the list that begins at an offset."""
     return 3 if data[offset] == _LIST_16 else 1
 
 
 @leaf
 def _after_floats(data: Bytes, offset: int, end: int, count: int) -> int:
-    """Returns the offset after some floating-point numbers. -1 if one of them is not finite."""
+    """Returns the offset after floating-point numbers, or -1 if one of them is not finite."""
     after = offset + NUMBER_BYTES * count
     if after > end:
         return _NOT_ACCEPTED
@@ -177,7 +179,7 @@ def _after_floats(data: Bytes, offset: int, end: int, count: int) -> int:
 def _after_vectors(
     data: Bytes, offset: int, end: int, first: int, vectors: Ints, layout: Any
 ) -> int:
-    """Returns the offset after some vectors with their names. -1 if any of them is missing."""
+    """Returns the offset after vectors with their names, or -1 if any is missing."""
     for n in range(vectors.shape[0]):
         offset = _after_literal(data, offset, end, first + n, layout)
         if offset >= 0:
@@ -189,10 +191,10 @@ def _after_vectors(
 
 @leaf
 def _after_stamps(data: Bytes, offset: int, end: int) -> int:
-    """Returns the offset after a list of arrivals: entries of three integers each.
+    """Returns the offset after a list of arrivals, each an entry of three integers.
 
-    An entry states which sample of another arm arrived, and when. The result is -1 if there is
-    no such list, or if a number is too large to be a time.
+    An entry states which sample of another arm arrived, and when. Returns -1 if there is no
+    such list, or if an integer is too large to be a time.
     """
     count = _list_count(data, offset, end)
     if count < 0:
@@ -221,8 +223,8 @@ def _after_stamps(data: Bytes, offset: int, end: int) -> int:
 def _after_texts(data: Bytes, offset: int, end: int) -> int:
     """Returns the offset after a list of ASCII strings, such as the changes in a record.
 
-    The result is -1 if there is no such list. Characters other than ASCII are left to the
-    general decoder, which checks their encoding.
+    Returns -1 if there is no such list. Non-ASCII characters are left to the general decoder,
+    which checks their encoding.
     """
     count = _list_count(data, offset, end)
     if count < 0:
@@ -255,10 +257,10 @@ def _after_texts(data: Bytes, offset: int, end: int) -> int:
 
 @leaf
 def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
-    """Returns the index of the controller's operating mode whose name begins at an offset.
+    """Returns the index of the mode whose name begins at an offset.
 
-    The result is -1 if no mode has this name. A name has at most eight letters, so it is
-    compared as one integer.
+    Returns -1 if no mode has this name. Names have at most eight letters, so they are compared
+    as one integer.
     """
     if offset < 0 or offset >= end:
         return _NOT_ACCEPTED
@@ -276,7 +278,7 @@ def _find_mode(data: Bytes, offset: int, end: int, layout: Any) -> int:
 
 @leaf
 def _mask_bytes(mask: int) -> int:
-    """Returns the number of bytes that a mask selects, from the least significant one on."""
+    """Returns the number of bytes that a mask selects, from the least significant one up."""
     count = 0
     while count < 8 and (mask >> (8 * count)) & 1:
         count += 1
@@ -287,9 +289,10 @@ def _mask_bytes(mask: int) -> int:
 def _scan_record(
     data: Bytes, start: int, end: int, layout: Any, heads: Ints, marks: Any, counts: Any
 ) -> bool:
-    """Checks that one encoded record has the expected bytes, and finds where its values lie.
+    """Checks that one encoded record has the expected bytes, and locates its values.
 
-    The arguments are those of `scan_records`, for one record from `start` to before `end`.
+    The arguments are those of `scan_records`, for one record from `start` up to, but excluding,
+    `end`.
 
     Returns:
         True if the record is accepted.
@@ -393,20 +396,19 @@ def scan_records(
 ) -> int:
     """Checks that each record has the exact layout, and finds where its values lie.
 
-    A record is the encoded state of an arm in one period of its control loop (tick). With the
-    offsets that this function finds, a field of all records can be read without decoding.
+    With the offsets found here, a field of all records can be read without decoding.
 
     Args:
         data: The records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
         ends: Offset after the last byte of each record, shape (K,).
         layout: The exact layout of the records, a `RecordLayout`.
-        heads: Receives the tick, the boot (identifier of the process) and the number of the
-            operating mode of each record, shape (K, 3). A boot of 2^63 or more is stored as the
-            signed number with the same bits.
-        marks: Receives the offsets of values (TIME, ...) from the start of each record,
+        heads: Output array for the tick, the boot (identifier of the process) and the mode code
+            of each record, shape (K, 3). A boot of 2^63 or more is stored as the signed integer
+            with the same bits.
+        marks: Output array for the offsets of values (TIME, ...) from the start of each record,
             shape (K, MARKS).
-        counts: Receives the lengths of lists (ARRIVAL_COUNT, ...), shape (K, COUNTS).
+        counts: Output array for the lengths of lists (ARRIVAL_COUNT, ...), shape (K, COUNTS).
 
     Returns:
         The number of records before the first one that is not accepted.
@@ -424,15 +426,15 @@ def scan_records(
 
 @loop_leaf
 def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints) -> None:
-    """Reads integers that follow each other, at known positions of each encoded record.
+    """Reads consecutive integers at known positions in each encoded record.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
-        marks: Offset at which the search for the numbers begins, from the start of each record,
-            shape (K,).
-        gaps: Number of other bytes before each of the N numbers, shape (N,).
-        numbers: Receives the numbers, shape (K, N).
+        marks: Offset at which the search for the integers begins, from the start of each
+            record, shape (K,).
+        gaps: Number of other bytes before each of the N integers, shape (N,).
+        numbers: Output array for the integers, shape (K, N).
     """
     for k in range(starts.shape[0]):
         offset = starts[k] + marks[k]
@@ -444,17 +446,17 @@ def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints
 
 @loop_leaf
 def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Ints) -> None:
-    """Reads some floating-point numbers, as their bits, from each record.
+    """Reads floating-point values from each encoded record as bit patterns.
 
-    Vectors have fixed lengths, so their numbers lie at fixed distances after a position in each
-    record, the mark.
+    Vectors have fixed lengths, so their entries lie at fixed offsets from a known position (the
+    mark) in each record.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
         marks: Offset of the mark from the start of each record, shape (K,).
-        places: Offset of each of the N numbers from the mark, shape (N,).
-        bits: Receives the bits of the numbers, shape (K, N).
+        places: Offset of each of the N values from the mark, shape (N,).
+        bits: Output array for the bit patterns, shape (K, N).
     """
     for k in range(starts.shape[0]):
         offset = starts[k] + marks[k] + 1  # the first byte of a number states its type
@@ -464,15 +466,15 @@ def gather_floats(data: Bytes, starts: Ints, marks: Any, places: Ints, bits: Int
 
 @loop_leaf
 def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: Ints) -> None:
-    """Reads the arrivals of samples (states of other arms) from every record.
+    """Reads the arrivals of samples from every encoded record.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
         marks: Offset of the list of arrivals from the start of each record, shape (K,).
         counts: Number of arrivals in each record, shape (K,).
-        numbers: Receives the N arrivals of all records in order, three numbers each, shape
-            (N, 3).
+        numbers: Output array for the N arrivals of all records in order, with three integers
+            per arrival, shape (N, 3).
     """
     row = 0
     for k in range(starts.shape[0]):
@@ -488,16 +490,16 @@ def gather_stamps(data: Bytes, starts: Ints, marks: Any, counts: Any, numbers: I
 
 @loop_leaf
 def gather_memories(data: Bytes, starts: Ints, marks: Any, counts: Any, bits: Ints) -> None:
-    """Reads the internal state of the control law from every encoded record, as bits.
+    """Reads the internal state of the control law from every record as bit patterns.
 
-    It is the field `mem` of a record.
+    The state is stored in the field `mem`.
 
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
-        marks: Offset of the first number from the start of each record, shape (K,).
-        counts: Count of numbers in each record, shape (K,).
-        bits: Receives the bits of the N numbers of all records, shape (N,).
+        marks: Offset of the first entry of the state from the start of each record, shape (K,).
+        counts: Length of the state vector in each record, shape (K,).
+        bits: Output array for the bit patterns of the N entries of all records, shape (N,).
     """
     row = 0
     for k in range(starts.shape[0]):

@@ -1,8 +1,8 @@
 """Converts the messages of a session to standard ROS 2 messages, for viewers and ROS programs.
 
-ROS 2 is the Robot Operating System. The standard messages are encoded without a ROS
-installation. They are stored beside the session's own messages in a log, exported as a ROS 2
-bag, or published while a session runs.
+ROS 2 is the Robot Operating System. Encoding the standard messages does not require a ROS
+installation. They can be stored in a log next to the session's own messages, exported as a ROS
+2 bag, or published while a session runs.
 """
 
 from typing import TYPE_CHECKING

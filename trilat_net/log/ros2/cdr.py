@@ -1,15 +1,15 @@
 """Encodes and decodes standard ROS 2 messages without a ROS installation.
 
-A log can thus contain messages that viewers understand, and arms can be connected to ROS
-programs. A message is encoded as little-endian CDR, the Common Data Representation of the OMG.
-It begins with a header of four bytes. Each field is aligned to its size, counted from the end
-of the header, and the padding before it is zero. A string or list begins with its length, a
-number of 32 bits.
+This allows logs to contain messages that viewers understand, and arms to be connected to ROS
+programs. Messages are encoded as little-endian CDR, the Common Data Representation of the OMG.
+A message begins with a header of four bytes. Each field is aligned to its size, counted from
+the end of the header, with zero bytes as padding. A string or list begins with its length as a
+32-bit number.
 
 Invariant:
     - The bytes of a message are the same as those of any other serializer.
-    - The layout of a message that is published at a high rate is computed once, so that it is
-      encoded by one call of `struct`.
+    - The layout of a message that is published at a high rate is computed once, so that a
+      single call of `struct` encodes the message.
 """
 
 import math
@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 from ...records import NS_PER_S
 
 ENCODING = "cdr"
-"""Encoding of the messages, as MCAP calls it."""
+"""Name of the message encoding in MCAP."""
 SCHEMA_ENCODING = "ros2msg"
-"""Encoding of the message definitions, as MCAP calls it."""
+"""Name in MCAP of the encoding of the message definitions."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 STRING = "std_msgs/msg/String"
@@ -44,13 +44,14 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 _HEAD = b"\x00\x01\x00\x00"
 """Header of a message: plain CDR, little-endian, no options."""
 _LAST_S = (1 << 31) - 1
-"""Latest time stamp of ROS 2, in s. A stamp contains the seconds in a signed number of 32 bits.
-"""
+"""Latest time stamp of ROS 2, in s. A stamp contains the seconds as a signed 32-bit integer."""
 _POSE_BYTES = 7 * 8
-"""Size of a transform: position and quaternion, seven floats of 8 bytes."""
+"""Size of a transform in bytes: position and quaternion, seven floats of 8 bytes."""
 
 DEFINITIONS = resources.files("trilat_net.log.ros2") / "definitions"
-"""Text files of ROS: message types, the quality of service of a bag, and the planar arm."""
+"""Folder of the ROS text files: message types, the quality of service of a bag, and the planar
+arm.
+"""
 _PACKED_TYPES = (
     JOINT_STATE,
     FLOAT64_ARRAY,
@@ -71,18 +72,18 @@ def _read_definition(type_name: str) -> bytes:
 
 
 ROS2_SCHEMAS = {type_name: _read_definition(type_name) for type_name in _PACKED_TYPES}
-"""Complete definitions of the message types that this module encodes, by name."""
+"""Maps the name of each message type that this module encodes to its complete definition."""
 
 
 def _pack_fields(offset: int, *values: int | str) -> bytes:
-    """Encodes numbers of 32 bits and strings.
+    """Encodes 32-bit integers and strings.
 
-    A string is encoded as its length with the terminating zero, then its bytes.
+    A string is encoded as its length including the terminating zero, followed by its bytes.
 
     Args:
         offset: Position of the first field, in bytes after the header. It determines the
             padding.
-        *values: The numbers and strings.
+        *values: The integers and strings.
     """
     data = b""
     for value in values:
@@ -96,7 +97,7 @@ def _pack_fields(offset: int, *values: int | str) -> bytes:
 
 
 def _count_padding(offset: int, size: int) -> int:
-    """Returns the number of bytes of padding before a field of `size` bytes at `offset`."""
+    """Returns the number of padding bytes before a field of `size` bytes at `offset`."""
     return -offset % size
 
 
@@ -131,9 +132,9 @@ def _format_floats(offset: int, count: int) -> tuple[str, int]:
 
 
 class JointStatePacker:
-    """Encodes messages of the type `sensor_msgs/msg/JointState` for one robot.
+    """Encodes messages of type `sensor_msgs/msg/JointState` for one robot.
 
-    The layout of the messages is computed once, so that encoding is fast.
+    The layout of the messages is computed once, which makes encoding fast.
 
     Args:
         names: Names of the joints.
@@ -169,7 +170,7 @@ class JointStatePacker:
         velocity: Sequence[float] = (),
         effort: Sequence[float] = (),
     ) -> bytes:
-        """Encodes one `sensor_msgs/msg/JointState`, the ROS 2 message about a robot's joints.
+        """Encodes a `sensor_msgs/msg/JointState`, the ROS 2 message for the joints of a robot.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -192,16 +193,16 @@ class JointStatePacker:
 
 
 class TransformPacker:
-    """Encodes messages of the type `tf2_msgs/msg/TFMessage`, which contain poses of frames.
+    """Encodes messages of type `tf2_msgs/msg/TFMessage`, which contain poses of frames.
 
-    The layout of the messages is computed once, so that encoding is fast.
+    The layout of the messages is computed once, which makes encoding fast.
 
     Args:
         frames: For each pose, the names of the parent frame and of the child frame.
     """
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        """Computes the positions of all fields in a transform message from the frames' names.
+        """Computes the positions of all fields in a transform message from the frame names.
 
         This is done once, so that encoding a message only fills in numbers.
         """
@@ -220,12 +221,12 @@ class TransformPacker:
         self._pack = struct.Struct(struct_format).pack
 
     def pack(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Encodes one `tf2_msgs/msg/TFMessage`, the ROS 2 message with poses of frames.
+        """Encodes a `tf2_msgs/msg/TFMessage`, the ROS 2 message for poses of frames.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            numbers: The poses of all frames, one after another: x, y, z in m and the quaternion
-                x, y, z, w.
+            numbers: The poses of all frames, one after another, each as x, y, z in m and the
+                quaternion x, y, z, w.
 
         Returns:
             The message in CDR, the binary format of ROS 2.
@@ -242,14 +243,15 @@ class TransformPacker:
 def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes]:
     """Creates a function that encodes arrays of a fixed shape for ROS 2.
 
-    The messages have the type `std_msgs/msg/Float64MultiArray`. Everything in a message except
+    The messages are of type `std_msgs/msg/Float64MultiArray`. Everything in a message except
     its numbers is encoded once, here.
 
     Args:
         dimensions: Label and size of each dimension of the array.
 
     Returns:
-        A function that encodes a message from the numbers of an array, row by row.
+        A function that takes the entries of an array, row by row, and returns the encoded
+        message.
     """
     sizes = [size for _, size in dimensions]
     count = math.prod(sizes)
@@ -266,14 +268,15 @@ def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes
 
 
 def pack_string(text: str) -> bytes:
-    """Encodes a ROS 2 message of the type `std_msgs/msg/String`, in the CDR format of ROS 2."""
+    """Encodes a string as a ROS 2 message of type `std_msgs/msg/String`."""
     return _HEAD + _pack_fields(0, text)
 
 
 class RosLogLevel(IntEnum):
-    """Severity of a line in the log of ROS, with the numbers that ROS 2 defines.
+    """Severity of a line in the ROS log, as numbered by ROS 2.
 
-    Events of a session become such lines. For example, an arm that diverged is an ERROR.
+    Events of a session are reported as such lines. For example, an arm that diverged is
+    reported as an ERROR.
     """
 
     INFO = 20
@@ -282,12 +285,12 @@ class RosLogLevel(IntEnum):
 
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
-    """Encodes a line for the log of ROS, a message of the type `rcl_interfaces/msg/Log`.
+    """Encodes a line of the ROS log as a message of type `rcl_interfaces/msg/Log`.
 
     Args:
         stamp_ns: Unix time of the line, in ns, 0 or more.
         level: Severity of the line.
-        name: Name of the member of the session that logs.
+        name: Name of the member of the session that reports the line.
         text: Text of the line.
     """
     seconds, rest_ns = _split_stamp(stamp_ns)
@@ -298,14 +301,14 @@ def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
 
 
 def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
-    """Encodes a pose, velocity or force in a frame, as a stamped message of ROS 2.
+    """Encodes a pose, velocity or force in a given frame as a stamped ROS 2 message.
 
     The messages `PoseStamped`, `TwistStamped` and `WrenchStamped` of the ROS package
-    geometry_msgs have the same structure. They differ only in their numbers.
+    geometry_msgs have the same structure and differ only in their numbers.
 
     Args:
         stamp_ns: Unix time of the message, in ns, 0 or more.
-        frame: Name of the frame in which the vectors are given.
+        frame: Name of the frame in which the vectors are expressed.
         numbers: For a pose, x, y, z in m and the quaternion x, y, z, w. For a twist, the
             velocity in m/s and the angular velocity in rad/s. For a wrench, the force in N and
             the torque in N m.
@@ -317,29 +320,29 @@ def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
 
 
 def pack_trigger_response(*, success: bool, text: str) -> bytes:
-    """Encodes the response of a ROS service of the type `std_srvs/srv/Trigger`.
+    """Encodes the response of a ROS service of type `std_srvs/srv/Trigger`.
 
-    Such a service does something, for example it stops an arm, and reports whether it
+    Such a service performs an action, such as stopping an arm, and reports whether it
     succeeded.
 
     Args:
-        success: True if the request was carried out.
+        success: True if the action was carried out.
         text: Explanation for the caller of the service.
     """
     return _HEAD + bytes([success]) + _pack_fields(1, text)
 
 
 class Diagnosis(NamedTuple):
-    """Status of one component, as a message of the ROS topic `/diagnostics` reports it.
+    """Status of one component, as reported in the ROS topic `/diagnostics`.
 
-    Monitors of robots show these statuses, with a colour for each level.
+    Robot monitors display these statuses, with one colour per level.
 
     Attributes:
-        level: 0 if the component is ok, 1 for a warning, 2 for an error, 3 if the status is too
-            old.
+        level: 0 if the component is ok, 1 for a warning, 2 for an error, 3 if the status is
+            outdated.
         name: Name of the component.
         text: Description of the status.
-        values: Further values as texts, by name.
+        values: Maps the names of further values to the values as strings.
     """
 
     level: int
@@ -351,7 +354,7 @@ class Diagnosis(NamedTuple):
 def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
     """Encodes the status of several components for the ROS topic `/diagnostics`.
 
-    The message has the type `diagnostic_msgs/msg/DiagnosticArray`.
+    The message is of type `diagnostic_msgs/msg/DiagnosticArray`.
 
     Args:
         stamp_ns: Unix time of the message, in ns, 0 or more.
@@ -373,8 +376,8 @@ def pack_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
 class _CdrReader:
     """Decodes a ROS 2 message field by field, in the order of its definition.
 
-    Every call of a method returns the next field. All methods raise a ValueError if the message
-    ends before the field does.
+    Every method call returns the next field. All methods raise ValueError if the message ends
+    before the field does.
 
     Args:
         payload: The message with its header of four bytes.
@@ -390,14 +393,11 @@ class _CdrReader:
         self._position = 0
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
-        """Decodes the next numbers of a ROS 2 message, in the CDR format of ROS 2.
+        """Decodes the next numbers of a ROS 2 message.
 
         Args:
             code: Type of the numbers, in the notation of the module `struct`.
-            count: Number of numbers to decode.
-
-        Returns:
-            The numbers.
+            count: How many numbers to decode.
         """
         size = struct.calcsize(f"<{code}")
         padding = _count_padding(self._position, size) if count else 0
@@ -408,13 +408,13 @@ class _CdrReader:
         return struct.unpack_from(f"<{count}{code}", self._data, start)
 
     def count(self) -> int:
-        """Decodes the number of entries of a list, which precedes the entries in the message.
+        """Decodes the length of a list, which precedes its entries in the message.
 
-        Each entry has at least one byte. A number above the remaining bytes is therefore wrong,
-        and is refused before memory is reserved for the entries.
+        Each entry takes at least one byte. A length greater than the number of remaining bytes
+        is therefore invalid, and is rejected before memory is allocated.
 
         Raises:
-            ValueError: Fewer bytes than entries remain.
+            ValueError: The length exceeds the number of remaining bytes.
         """
         (count,) = self.numbers("I")
         # With a wrong length, the caller would reserve memory for entries that do not exist.
@@ -423,7 +423,7 @@ class _CdrReader:
         return int(count)
 
     def text(self) -> str:
-        """Decodes the next string of a ROS 2 message, and moves on to the next field."""
+        """Decodes the next string of a ROS 2 message, and advances the reader."""
         length = self.count()
         if not length:
             return ""
@@ -431,13 +431,11 @@ class _CdrReader:
         return bytes(data).removesuffix(b"\0").decode()
 
     def floats(self) -> tuple[float, ...]:
-        """Decodes the next list of floats of a ROS 2 message, and moves to the next field."""
+        """Decodes the next list of floats of a ROS 2 message, and advances the reader."""
         return self.numbers("d", self.count())
 
     def header(self) -> tuple[int, str]:
-        """Decodes the time and the frame with which many ROS 2 messages begin.
-
-        Their type is `std_msgs/msg/Header`.
+        """Decodes the header of type `std_msgs/msg/Header` at the start of many ROS 2 messages.
 
         Returns:
             The time stamp in ns on the sender's clock, and the name of the coordinate frame.
@@ -448,14 +446,14 @@ class _CdrReader:
 
 
 class RosJoints(NamedTuple):
-    """State of a robot's joints, decoded from a message `sensor_msgs/msg/JointState`.
+    """State of a robot's joints, decoded from a `sensor_msgs/msg/JointState` message.
 
     Attributes:
         stamp_ns: Time of the message on the sender's clock, in ns.
-        names: Names of the joints. The following values have the same order.
-        position: Joint angles, in rad. Empty if they are not known.
-        velocity: Joint velocities, in rad/s. Empty if they are not known.
-        effort: Joint torques, in N m. Empty if they are not known.
+        names: Names of the joints. The other attributes use the same order.
+        position: Joint angles, in rad. Empty if unknown.
+        velocity: Joint velocities, in rad/s. Empty if unknown.
+        effort: Joint torques, in N m. Empty if unknown.
     """
 
     stamp_ns: int
@@ -466,10 +464,10 @@ class RosJoints(NamedTuple):
 
     @classmethod
     def read(cls, payload: bytes) -> "RosJoints":
-        """Decodes a `sensor_msgs/msg/JointState`, the usual message with the joints of a robot.
+        """Decodes a `sensor_msgs/msg/JointState`, the usual message for the joints of a robot.
 
         Args:
-            payload: The message.
+            payload: The encoded message.
 
         Raises:
             ValueError: The message cannot be decoded.
@@ -487,7 +485,7 @@ class RosJoints(NamedTuple):
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:
-    """Decodes the numbers of a `std_msgs/msg/Float64MultiArray` in the order of the message.
+    """Decodes the numbers of a `std_msgs/msg/Float64MultiArray`, in message order.
 
     The layout, which states the sizes of the dimensions, is skipped.
 
@@ -504,18 +502,18 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
 
 
 def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
-    """Decodes a pose or a force from a stamped message of ROS 2.
+    """Decodes a pose or a force from a stamped ROS 2 message.
 
-    The message has the type `PoseStamped` or `WrenchStamped`.
+    The message is of type `PoseStamped` or `WrenchStamped`.
 
     Args:
-        payload: The message.
-        count: Number of its numbers: 7 for a pose, 6 for a wrench.
+        payload: The encoded message.
+        count: How many numbers the message contains: 7 for a pose, 6 for a wrench.
 
     Returns:
-        The name of the frame in which the vectors are given, and the numbers. The numbers of a
-        pose are x, y, z in m and the quaternion x, y, z, w. The numbers of a wrench are the
-        force in N and the torque in N m.
+        The name of the frame in which the vectors are expressed, and the numbers: for a pose,
+            x, y, z in m and the quaternion x, y, z, w; for a wrench, the force in N and the
+            torque in N m.
 
     Raises:
         ValueError: The message cannot be decoded.

@@ -1,15 +1,14 @@
 """Defines the topics under which ROS 2 programs see a session, and encodes their messages.
 
-ROS 2 is the Robot Operating System. The command `trilat ros2` publishes a running session as
-ROS 2 topics (the live bridge), and the export `ros2` converts a log to a bag, a recording of
-ROS 2. Both use this module. A bag contains a message for every record, the state of an arm in
-one period of its control loop. The live bridge publishes a part of these messages.
+The command `trilat ros2` publishes a running session as ROS 2 topics (the live bridge), and the
+export `ros2` converts a log to a bag, a recording of ROS 2. Both use this module. A bag
+contains one message per record. The live bridge publishes some of these messages.
 
 Invariant:
     - The live bridge and a bag have the same topics with the same types and the same numbers,
       because this module encodes the messages of both.
-    - The quaternions of a topic do not jump. Two quaternions of opposite sign are the same
-      orientation. The one that is nearer to the previous quaternion is chosen.
+    - The quaternions of a topic do not jump. Two quaternions of opposite sign represent the
+      same orientation, and the one closer to the previous quaternion is chosen.
     - A message is encoded only if its topic is wanted.
 """
 
@@ -42,16 +41,17 @@ if TYPE_CHECKING:
     from ...log import Log
 
 Topics = dict[str, Ros2Channel]
-"""Descriptions of the topics of one site, by their names within trilat-net."""
+"""Maps the trilat-net name of each topic of one site to its description."""
 
 IsWanted = Callable[[str], bool]
-"""Function that returns True if the message of a topic is needed, by its name in trilat-net."""
+"""Function that takes the trilat-net name of a topic and returns True if its message is needed.
+"""
 
 _OK = 0
 _WARNING = 1
 _ERROR = 2
 _LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
-"""Levels in `/diagnostics` by mode. Other modes have the level `_WARNING`."""
+"""Maps modes to levels in `/diagnostics`. Other modes have the level `_WARNING`."""
 _QUATERNION_TEXT = "unit quaternion, each nearest to the one before"
 _NO_ROTATION = (0.0, 0.0, 0.0)
 """Angular part of a velocity or wrench, if the sites share only positions."""
@@ -66,7 +66,9 @@ COMMON_TOPICS = {
     FRAMES_TOPIC: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
     DIAGNOSTICS: Ros2Channel(cdr.DIAGNOSTICS, _DIAGNOSTICS_METADATA),
 }
-"""Topics that all sessions have in common, by their names without the leading "/"."""
+"""Maps the names, without the leading "/", of topics common to all sessions to their
+descriptions.
+"""
 
 
 _INDEX_ERRORS = (
@@ -77,18 +79,18 @@ _INDEX_ERRORS = (
     ValueError,
     OverflowError,
 )
-"""Errors of the library `mcap` for a file whose index cannot be read."""
+"""Errors raised by the library `mcap` for a file whose index cannot be read."""
 
 
 class Ros2Topics(dict[str, Ros2Channel]):
-    """Descriptions of ROS 2 topics, by their full names, which begin with "/"."""
+    """Maps the full names of ROS 2 topics, which begin with "/", to their descriptions."""
 
     @classmethod
     def of_session(cls, scenario: Scenario, session: str, table: TopicTable) -> "Ros2Topics":
         """Lists all topics under which a session is published, by the bridge or in a bag.
 
         Args:
-            scenario: Scenario of the session, its description in a TOML file.
+            scenario: Scenario of the session.
             session: Name of the session.
             table: Names of the topics in ROS 2.
         """
@@ -106,10 +108,10 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
     @classmethod
     def of_log(cls, log: "Log") -> "Ros2Topics":
-        """Lists the topics under which a bridge would publish the session of a log live.
+        """Lists the topics that a bridge would use to publish the session of a log live.
 
-        Files for viewers then work for the log and for the live session. The names follow the
-        first of the built-in conventions.
+        Files for viewers then work for the log and for the live session alike. The names follow
+        the first of the built-in conventions.
 
         Args:
             log: Log of the session.
@@ -123,10 +125,11 @@ class Ros2Topics(dict[str, Ros2Channel]):
         """Lists the standard ROS 2 channels that a finished log or bag contains.
 
         Args:
-            path: The file.
+            path: Path of the file.
 
         Returns:
-            The descriptions of the channels, by topic. Empty if the file has no readable index.
+            Maps each topic to the description of its channel. Empty if the file has no readable
+            index.
 
         Raises:
             LogError: The file cannot be opened.
@@ -148,7 +151,7 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
     @property
     def are_of_log(self) -> bool:
-        """True if the topics are those that a log contains for viewers, and not those of a bag.
+        """True if the topics are those of a log (for viewers) rather than those of a bag.
 
         False for a file without topics.
         """
@@ -156,18 +159,18 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
 
 class SiteMessages:
-    """Encodes everything that one arm controller (site) publishes as ROS 2 messages.
+    """Encodes everything that one site publishes as ROS 2 messages.
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site, a process that runs one arm.
-        epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
-            virtual time.
+        site: Name of the site.
+        epoch_unix_ns: Start time of the session (tick 0) in Unix time, in ns; 0 in virtual
+            time.
 
     Attributes:
-        topics: Description of each topic of the site, by its name in trilat-net. The topics of
-            the whole session and `/tf` are not included.
-        frame: Name of the frame in which the poses of the end effector are given.
+        topics: Maps the trilat-net name of each topic of the site to its description. The
+            topics of the session as a whole and `/tf` are not included.
+        frame: Name of the frame in which the poses of the end effector are expressed.
         description: Message of the topic `robot_description`, the model of the arm.
     """
 
@@ -211,13 +214,13 @@ class SiteMessages:
         self.topics = self._list_topics(peers)
 
     def _list_topics(self, peers: Sequence[str]) -> Topics:
-        """Lists the topics of the site (arm controller), by their names in trilat-net.
+        """Maps the trilat-net name of each topic of the site to its description.
 
         The topics of the reference depend on whether the sites exchange joint angles or the
         pose of the end effector.
 
         Args:
-            peers: Names of the other sites.
+            peers: Names of the peers.
         """
         channels = self._channels
         topics: Topics = {}
@@ -249,7 +252,7 @@ class SiteMessages:
         return topics | self._list_array_topics()
 
     def _describe_pose(self, subject: str) -> Ros2Channel:
-        """Returns a topic with poses of the end effector or of its reference."""
+        """Describes a topic with poses of the end effector or of its reference."""
         about = {
             "content": f"pose of {subject}",
             "unit": "m",
@@ -259,7 +262,7 @@ class SiteMessages:
         return Ros2Channel(cdr.POSE, about)
 
     def _describe_twist(self, subject: str) -> Ros2Channel:
-        """Returns a topic with velocities of the end effector or of its reference."""
+        """Describes a topic with velocities of the end effector or of its reference."""
         about = {
             "content": f"velocity of {subject}",
             "unit": "m/s, rad/s",
@@ -283,13 +286,12 @@ class SiteMessages:
         return topics
 
     def stamp_ns(self, record: State) -> int:
-        """Returns the time stamp of all ROS 2 messages that are derived from one record.
+        """Returns the time stamp of the ROS 2 messages derived from one record, in ns.
+
+        This is the nominal time of the record's tick, in Unix time.
 
         Args:
             record: The record.
-
-        Returns:
-            The nominal time of the record's tick, in Unix time, in ns.
         """
         return max(0, self._epoch_unix_ns + record.t_ns)
 
@@ -299,19 +301,18 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> NamedMessages:
-        """Converts the state of an arm in one control period to ROS 2 messages.
+        """Converts the record of a site to ROS 2 messages.
 
-        The state is a record of a site (arm controller): motion, reference, torques and mode.
+        The record contains the motion, reference, torques and mode of the arm at one tick.
 
         Args:
-            record: The record. The records must be passed in the order of their times, because
-                the signs of quaternions depend on the previous record.
-            shares: Dominance factors at the time of the record: the weights with which the site
-                follows each of the other sites.
+            record: The record. Records must be passed in chronological order, because the signs
+                of quaternions depend on the previous record.
+            shares: Dominance factors at the time of the record.
             is_wanted: Function that returns False for topics whose messages are not needed.
 
         Yields:
-            For each wanted topic, its name in trilat-net, and the encoded message.
+            For each wanted topic, its trilat-net name and the encoded message.
         """
         stamp_ns = self.stamp_ns(record)
         if is_wanted("joint_states"):
@@ -338,8 +339,7 @@ class SiteMessages:
     ) -> NamedMessages:
         """Encodes the reference of the joints, and the pose of the end effector.
 
-        This applies if the sites (arm controllers) share joint angles. The pose is computed
-        from them.
+        Used if the sites share joint angles. The pose is computed from them.
         """
         if is_wanted("reference"):
             data = self._pack_reference(stamp_ns, record.q_des, record.qd_des)
@@ -352,8 +352,8 @@ class SiteMessages:
     ) -> NamedMessages:
         """Encodes the motion of the end effector, its reference, and the wrench on it.
 
-        This applies if the sites share the position or pose of the end effector instead of the
-        joint positions. The task scale enlarges or reduces the motion that the sites share:
+        Used if the sites share the position or pose of the end effector instead of the joint
+        positions. The task scale enlarges or reduces the motion that the sites share:
 
             shared motion = scale * motion of this arm.
 
@@ -363,12 +363,12 @@ class SiteMessages:
 
         Args:
             record: The record of one tick of the site.
-            stamp_ns: Time of the record, in Unix time, in ns.
+            stamp_ns: Time of the record in Unix time, in ns.
             is_wanted: Function that returns True if a program has subscribed to the topic with
-                a name.
+                a given name.
 
         Yields:
-            The name of each wanted topic in trilat-net, and the message.
+            The trilat-net name of each wanted topic, and the message.
         """
         motions = [
             ("tip", record.x, record.xd),
@@ -402,7 +402,7 @@ class SiteMessages:
         linear: Sequence[float],
         angular: Sequence[float],
     ) -> bytes:
-        """Encodes the linear and the angular part of a quantity in the frame of the site."""
+        """Encodes the linear and angular parts of a quantity in the frame of the site."""
         return cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
 
     def _pack_pose(
@@ -416,10 +416,9 @@ class SiteMessages:
 
         Args:
             topic: Name of the topic. Successive quaternions of a topic do not jump.
-            record: The record (result of a control period).
-            pose: The pose that the sites (arm controllers) exchange. Empty if they exchange
-                joint angles.
-            stamp_ns: Time of the message, in Unix time, in ns.
+            record: The record.
+            pose: The pose that the sites exchange. Empty if they exchange joint angles.
+            stamp_ns: Time of the message in Unix time, in ns.
         """
         rotation_vector = self._compute_rotation_vector(record, pose)
         quaternion = compute_quaternion(rotation_vector)
@@ -430,13 +429,11 @@ class SiteMessages:
         return self._pack_vectors(stamp_ns, position, aligned_quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
-        """Returns the position of the arm's end effector from a record, in m.
+        """Returns the position of the end effector in a record, in m.
 
         Args:
-            record: The record (result of a control period), whose joint angles are used if
-                there is no pose.
-            pose: The pose that the sites (arm controllers) exchange. Empty if they exchange
-                joint angles.
+            record: The record. Its joint angles are used if there is no pose.
+            pose: The pose that the sites exchange. Empty if they exchange joint angles.
         """
         if pose:
             coordinates = pose[:POSITION]
@@ -457,21 +454,20 @@ class SiteMessages:
         return self._arm.end_effector_orientation(record.q)
 
     def _pack_arrays(self, record: State, is_wanted: IsWanted) -> NamedMessages:
-        """Encodes the numbers of a record that have no standard ROS type, as labelled arrays.
+        """Encodes the quantities of a record with no standard ROS type, as labelled arrays.
 
         These are the error e = q - q_des, and the arrays that viewers receive at a reduced rate
-        ("slow"): the exogenous torque, the estimated parameters, the numbers that the control
-        law sends, and the mode. In `pack_slow_arrays`, the slow arrays are encoded together,
-        and only the wanted ones are yielded.
+        ("slow"): the exogenous torque, the estimated parameters, the vectors that the control
+        law sends, and the mode. `pack_slow_arrays` encodes the slow arrays together, and only
+        the wanted ones are yielded.
 
         Args:
-            record: The record (result of a control period) of one tick (control period) of the
-                site.
+            record: The record of one tick of the site.
             is_wanted: Function that returns True if a program has subscribed to the topic with
-                a name.
+                a given name.
 
         Yields:
-            The name of each wanted topic in trilat-net, and the message.
+            The trilat-net name of each wanted topic, and the message.
         """
         channels = self._channels
         array_topics = [_name_array_topic(name) for name in channels.record_arrays]
@@ -492,10 +488,10 @@ class SiteMessages:
                 yield topic, data
 
     def pack_frames(self, record: State) -> Iterable[bytes]:
-        """Encodes the poses of all links of an arm for viewers, in one control period.
+        """Encodes the poses of all links of an arm at one tick, for viewers.
 
         Args:
-            record: The record (result of a control period), which contains the joint positions.
+            record: The record, which contains the joint positions.
 
         Yields:
             The messages for the topic `/tf`.
@@ -520,18 +516,18 @@ class SiteMessages:
             stats: The statistics.
 
         Yields:
-            The name of the topic in trilat-net, and the message.
+            The trilat-net name of the topic, and the message.
         """
         yield from self._channels.pack_statistics(stats)
 
 
 def _name_array_topic(name: str) -> str:
-    """Returns the topic of an array. The topic `mode` already contains the mode as a string."""
+    """Returns the topic of an array. The topic `mode` already holds the mode as a string."""
     return "mode_number" if name == "mode" else name
 
 
 def _fill_rotation(values: Sequence[float]) -> list[float]:
-    """Returns the angular part of a velocity or wrench. It is zero if there is none."""
+    """Returns the angular part of a velocity or wrench, or zeros if there is none."""
     angular = [*values[POSITION:], *_NO_ROTATION]
     return angular[:POSITION]
 
@@ -539,14 +535,13 @@ def _fill_rotation(values: Sequence[float]) -> list[float]:
 def pack_session_diagnostics(
     session: str, epoch_unix_ns: int, records: Sequence[State]
 ) -> bytes:
-    """Encodes the status of all arm controllers for the ROS 2 topic `/diagnostics`.
+    """Encodes the status of all sites for the ROS 2 topic `/diagnostics`.
 
     Args:
         session: Name of the session.
-        epoch_unix_ns: Start time of the session (tick 0), in Unix time, in ns. It is 0 in
-            virtual time.
-        records: Newest record (result of a control period) of each site (arm controller) that
-            has published records.
+        epoch_unix_ns: Start time of the session (tick 0) in Unix time, in ns; 0 in virtual
+            time.
+        records: Newest record of each site that has published any.
 
     Returns:
         The message, with one status per site.

@@ -1,14 +1,14 @@
 """Builds the model of an arm that a viewer draws: its URDF, and the poses of its links.
 
-URDF is an XML description of a robot by its links (bodies) and joints. A viewer draws the arms
-of all sites (processes that run one arm) in one scene. They stand in a row, `SPACING_M` apart,
-in a common frame `WORLD` whose z axis points up. If a URDF contains no shapes, plain shapes are
-added, so that the arm is visible. The files of meshes are never opened.
+URDF is an XML format that describes a robot by its links (bodies) and joints. A viewer draws
+the arms of all sites in one scene. They stand in a row, `SPACING_M` apart, in a common frame
+`WORLD` whose z axis points up. If a URDF contains no shapes, plain shapes are added to make the
+arm visible. Mesh files are never opened.
 
 Invariant:
     - The frame of a link is named "<site>/<link>", both in the URDF and in the transforms, so
-      that arms with the same URDF can be shown together.
-    - The joints have the same names in the URDF as in the messages with joint states.
+      that several arms with the same URDF can be shown together.
+    - The joints have the same names in the URDF as in the joint state messages.
     - The transforms place the end effector at the position that the site computes.
 """
 
@@ -28,14 +28,14 @@ SPACING_M = 1.5
 _RADIUS_M = 0.035
 """Radius of the plain shape of a link, in m."""
 _SHAPE_COLOURS = ("0 0.27 0.53 1", "0.73 0.33 0.4 1", "0.87 0.67 0.2 1", "0.4 0.4 0.4 1")
-"""Colours of the plain shapes, site by site: red, green, blue and opacity, from 0 to 1."""
+"""Colours of the plain shapes, one per site: red, green, blue and opacity, from 0 to 1."""
 
 Vector = tuple[float, float, float]
 """A vector x, y, z."""
 Quaternion = tuple[float, float, float, float]
 """A unit quaternion x, y, z, w."""
 Transform = tuple[Vector, Quaternion]
-"""The pose of a frame in its parent: origin in m, and rotation."""
+"""The pose of a frame relative to its parent: origin in m, and rotation."""
 FramePose = tuple[Sequence[float], Sequence[float]]
 """The same pose as two sequences: origin in m, and quaternion x, y, z, w."""
 
@@ -52,11 +52,11 @@ class _JointFrame(NamedTuple):
 
     Attributes:
         origin_m: Origin of the link's frame in the parent link's frame, in m.
-        rotation: Rotation of the link's frame at the joint position 0.
+        rotation: Rotation of the link's frame at joint position 0.
         axis: Axis of the joint in the frame of the link, a unit vector.
-        is_prismatic: True if the joint slides along its axis instead of turning about it.
-        q_index: Index of the joint's position in q. It is -1 for a joint that does not move,
-            such as a finger of a gripper.
+        is_prismatic: True if the joint slides along its axis instead of rotating about it.
+        q_index: Index of the joint's position in q, or -1 for a joint that does not move, such
+            as a finger of a gripper.
     """
 
     origin_m: Vector
@@ -66,7 +66,7 @@ class _JointFrame(NamedTuple):
     q_index: int
 
     def compute_transform(self, position: float) -> Transform:
-        """Computes the pose of a link relative to the link before it, by the joint's position.
+        """Computes the pose of a link relative to its parent, for a given joint position.
 
         Args:
             position: Position of the joint, in rad or m.
@@ -90,7 +90,7 @@ class _JointFrame(NamedTuple):
 def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
     """Computes the product a b of two quaternions.
 
-    For unit quaternions, the product is the rotation b, followed by the rotation a.
+    For unit quaternions, the product represents rotation b followed by rotation a.
 
     Args:
         a: The left factor.
@@ -107,10 +107,10 @@ def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
-    """Rotates a vector by a rotation that is given as a unit quaternion.
+    """Rotates a vector by a unit quaternion.
 
-    The result is q v q*, with the vector v as a quaternion without scalar part, and the
-    conjugate q* of q.
+    Computes q v q*, where v is taken as a quaternion without scalar part, and q* is the
+    conjugate of q.
 
     Args:
         rotation: The unit quaternion q.
@@ -124,7 +124,7 @@ def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
 
 
 def _rotate_about(axis: Vector, angle: float) -> Quaternion:
-    """Returns the quaternion of a rotation about a unit vector by an angle in rad."""
+    """Returns the quaternion for a rotation about a unit vector by an angle in rad."""
     half_angle = angle / 2.0
     sine = math.sin(half_angle)
     cosine = math.cos(half_angle)
@@ -133,7 +133,7 @@ def _rotate_about(axis: Vector, angle: float) -> Quaternion:
 
 
 def compute_quaternion(rotation_vector: Vector) -> Quaternion:
-    """Converts a rotation vector to a unit quaternion (x, y, z, w).
+    """Converts a rotation vector in rad to a unit quaternion (x, y, z, w).
 
     Args:
         rotation_vector: Axis of the rotation times its angle, in rad.
@@ -147,7 +147,7 @@ def compute_quaternion(rotation_vector: Vector) -> Quaternion:
 
 
 def _rotate_upright(down: Sequence[float]) -> Quaternion:
-    """Returns the shortest rotation that turns a direction to -z.
+    """Returns the shortest rotation that takes a given direction to -z.
 
     Args:
         down: The direction of gravity. It need not be a unit vector.
@@ -169,7 +169,7 @@ def _rotate_upright(down: Sequence[float]) -> Quaternion:
 
 
 def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
-    """Returns the rotation by roll, pitch and yaw in rad, about the fixed x, y and z axes."""
+    """Returns the rotation for roll, pitch and yaw in rad, about the fixed x, y and z axes."""
     roll, pitch, yaw = rpy
     yaw_rotation = _rotate_about(_Z_AXIS, yaw)
     pitch_rotation = _rotate_about(_Y_AXIS, pitch)
@@ -179,15 +179,15 @@ def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
 
 
 _PLANAR = (DEFINITIONS / "planar.urdf").read_text(encoding="utf-8")
-"""URDF of the planar arm, with placeholders for names of joints and lengths of links."""
+"""URDF of the planar arm, with placeholders for the names of joints and the lengths of links.
+"""
 
 
 def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
     """Lists the names of an arm's joints in ROS messages and in the URDF for viewers.
 
-    Joints keep the names of their URDF. If no arm of the scenario has a URDF, the joints have
-    the same names at all sites (arm controllers). The name of the site is therefore put in
-    front: "m1_q1".
+    Joints keep the names from their URDF. If no arm of the scenario has a URDF, the joints have
+    the same names at all sites, so the name of the site is added as a prefix: "m1_q1".
 
     Args:
         scenario: Scenario of the session.
@@ -203,7 +203,7 @@ def name_ros_joints(scenario: Scenario, site: str) -> list[str]:
 
 
 class RobotModel:
-    """The arm of one site (arm controller) as a tree of rigid links, for viewers that draw it.
+    """The arm of one site as a tree of rigid links, for viewers that draw it.
 
     The model is built from the URDF of the arm, or from the built-in planar arm.
 
@@ -269,15 +269,15 @@ class RobotModel:
         self.description = _describe_robot(root, site, site_number)
 
     def compute_transforms(self, q: Sequence[float]) -> list[Transform]:
-        """Computes the poses of the arm's links for given positions of its joints.
+        """Computes the poses of the arm's links for given joint positions.
 
         Viewers draw the arm from these poses.
 
         Args:
-            q: Positions of the joints, in rad or m.
+            q: Joint positions, in rad or m.
 
         Returns:
-            The pose of each frame in its parent frame, in the order of `frames`.
+            The pose of each frame relative to its parent frame, in the order of `frames`.
         """
         transforms: list[Transform] = [self._base]
         for joint in self._joints:
@@ -288,22 +288,21 @@ class RobotModel:
         return transforms
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
-        """Encodes the poses of all links of an arm as one ROS 2 message of the topic `/tf`.
+        """Encodes the poses of all links of an arm as one ROS 2 message for the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            q: Positions of the joints, in rad or m.
+            q: Joint positions, in rad or m.
         """
         transforms = self.compute_transforms(q)
         return self.pack_transforms(stamp_ns, transforms)
 
     def pack_transforms(self, stamp_ns: int, transforms: Iterable[FramePose]) -> bytes:
-        """Encodes given poses of frames as one ROS 2 message of the topic `/tf`.
+        """Encodes given poses of frames as one ROS 2 message for the topic `/tf`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            transforms: For each frame of `frames` the origin in m, and the quaternion x, y, z,
-                w.
+            transforms: The origin in m and the quaternion x, y, z, w of each frame in `frames`.
         """
         numbers: list[float] = []
         for origin, rotation in transforms:
@@ -315,7 +314,7 @@ def _list_joints(root: Element, base: str) -> list[Element]:
     """Lists the joints of a URDF below a link, parents before children.
 
     Args:
-        root: The URDF.
+        root: Root element of the URDF.
         base: Name of the link.
     """
     joints_of_parent: dict[str, list[Element]] = {}
@@ -348,16 +347,16 @@ def _get_link(joint: Element, end: str) -> str:
 
 
 def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
-    """Parses an attribute with three numbers.
+    """Parses an attribute that contains three numbers.
 
-    The default is returned if the attribute does not contain three finite numbers. This is
-    possible only in branches of the URDF that are not part of the arm, because `read_urdf`
-    checks the arm.
+    The default is returned if the attribute does not contain three finite numbers. This can
+    happen only in branches of the URDF that are not part of the arm, because `read_urdf` checks
+    the arm.
 
     Args:
         element: Element of the URDF. None if it is absent.
         key: Name of the attribute.
-        default: The default.
+        default: Value to return if the attribute is invalid.
     """
     if element is None:
         return default
@@ -398,13 +397,13 @@ def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame
 def _describe_robot(root: Element, site: str, site_number: int) -> str:
     """Returns the URDF of a site's arm as a string for viewers.
 
-    The site's name is put in front of the names of the links, so that several arms with the
-    same URDF can be shown together. Links get plain shapes if the URDF contains none, because
-    the arm would otherwise be invisible.
+    The names of the links are prefixed with the name of the site, so that several arms with the
+    same URDF can be shown together. If the URDF contains no shapes, plain shapes are added to
+    the links, because the arm would otherwise be invisible.
 
     Args:
-        root: The URDF, which is changed.
-        site: Name of the site (arm controller).
+        root: Root element of the URDF, which is modified.
+        site: Name of the site.
         site_number: Index of the site, which determines the colour.
     """
     has_shapes = root.find("link/visual") is not None
@@ -445,7 +444,7 @@ def _add_shape(link: Element, end_m: Vector, colour: str, site: str) -> None:
         link: The link's element in the URDF.
         end_m: The point in the frame of the link, in m.
         colour: Red, green, blue and opacity, from 0 to 1.
-        site: Name of the site (arm controller), which makes the name of the material unique.
+        site: Name of the site, which makes the name of the material unique.
     """
     x, y, z = end_m
     length_m = math.hypot(x, y, z)

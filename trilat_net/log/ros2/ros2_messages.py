@@ -1,15 +1,16 @@
 """Converts the messages of a session to standard ROS 2 messages for general viewers.
 
-Only trilat-net can decode the session's own messages in a log. Therefore a log may also contain
-channels of standard ROS 2 messages, which viewers such as Foxglove and PlotJuggler display.
-This module defines these channels with their units and names, and converts the messages.
+The session's own messages in a log can be decoded only by trilat-net. A log may therefore also
+contain channels of standard ROS 2 messages, which viewers such as Foxglove and PlotJuggler can
+display. This module defines these channels with their units and names, and converts the
+messages.
 
 Invariant:
-    - Values are copied without a conversion. Only times are converted, to the unit that is
-      stated in the metadata of the channel.
+    - Values are copied unchanged, except that times are converted to the unit stated in the
+      metadata of the channel.
     - A value that was not measured is NaN.
-    - Each curve has a name, which viewers display. Joint states contain the names of the
-      joints. In an array, the label of each dimension lists the names of its entries.
+    - Each curve has a name that viewers display. Joint states contain the names of the joints.
+      In an array, the label of each dimension lists the names of its entries.
 """
 
 import math
@@ -28,16 +29,16 @@ from . import cdr
 from .robot_model import RobotModel, name_ros_joints
 
 EVENTS = "events"
-"""Channel of the session's events as plain text."""
+"""Channel with the events of the session as plain text."""
 LINES = "log"
-"""Channel of the session's events as log lines, with time and level."""
+"""Channel with the events of the session as log lines, with time and level."""
 SENT_PREFIX = "sent_"
-"""Prefix of the arrays with the vectors that a law sends: "sent_E", "sent_u_to_m2"."""
+"""Prefix of arrays for the vectors that a law sends: "sent_E", "sent_u_to_m2"."""
 
 ROBOT = "robot_description"
-"""Channel with the URDF of an arm."""
+"""Channel that contains the URDF of an arm."""
 FRAMES = "tf"
-"""Channel with the frames of an arm's links."""
+"""Channel that contains the frames of an arm's links."""
 
 NamedMessages = Iterator[tuple[str, bytes]]
 """Encoded messages, each with the name of its channel or topic."""
@@ -48,7 +49,7 @@ class Ros2Channel(NamedTuple):
 
     Attributes:
         kind: ROS type of the messages.
-        about: Metadata of the channel, such as units and names of its numbers.
+        about: Metadata of the channel, such as the units and names of its numbers.
         latched: True if a subscriber that joins late receives the last message.
     """
 
@@ -64,26 +65,26 @@ class Ros2Channel(NamedTuple):
     def name_numbers(self) -> list[str]:
         """Returns the names of the numbers in a message of the channel, in order.
 
-        The metadata has a list of names for each axis of the numbers, such as "m1 m2; 1 2". The
-        name of a number combines one name of each axis.
+        The metadata contain one list of names per dimension of the array, such as "m1 m2; 1 2".
+        The name of a number combines one name from each list.
         """
         axes = [axis.split(" ") for axis in self.about.get("names", "").split("; ")]
         return [" ".join(filter(None, parts)) for parts in product(*axes)]
 
 
 Ros2Channels = Mapping[str, Ros2Channel]
-"""Channels of standard ROS 2 messages, by topic."""
+"""Maps topics to channels of standard ROS 2 messages."""
 
 
 class StandardChannels:
-    """Registers ROS 2 channels for viewers in an MCAP file, each when it is first needed.
+    """Registers ROS 2 channels for viewers in an MCAP file when they are first needed.
 
     Indexing the object with the topic of a channel returns the number of the channel in the
-    file. If the channel is not registered yet, it is registered first.
+    file, after registering the channel if necessary.
 
     Args:
-        file: The file.
-        known: Descriptions of the channels that may be registered, by topic.
+        file: Writer of the MCAP file.
+        known: Maps the topic of each channel that may be registered to its description.
     """
 
     def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
@@ -95,7 +96,7 @@ class StandardChannels:
     def __getitem__(self, topic: str) -> int:
         """Returns the number of a topic's channel in an MCAP file.
 
-        The channel is registered in the file at the first access, so that the file declares no
+        The channel is registered in the file on first access, so that the file declares no
         channel without messages.
         """
         if topic not in self._channel_numbers:
@@ -108,7 +109,7 @@ class StandardChannels:
         return self._channel_numbers[topic]
 
     def _get_schema_number(self, kind: str) -> int:
-        """Returns the number of a message type, and registers the type if necessary."""
+        """Returns the number of a message type, registering the type if necessary."""
         if kind not in self._schema_numbers:
             definition = cdr.ROS2_SCHEMAS[kind]
             schema_number = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, definition)
@@ -121,7 +122,7 @@ SESSION_CHANNELS = {
     LINES: Ros2Channel(cdr.LOG, {"content": "the same as lines of a log"}),
 }
 ROBOT_METADATA = {"content": "URDF, with links named after their site"}
-"""Metadata of a channel with the URDF of an arm."""
+"""Metadata of a channel that contains the URDF of an arm."""
 _FRAMES_METADATA = {
     "content": "frames of the links",
     "unit": "m",
@@ -142,16 +143,16 @@ _LEVELS = {
     "refused": cdr.RosLogLevel.WARN,
     "clock fault": cdr.RosLogLevel.WARN,
 }
-"""Level of an event in the log of ROS by its kind. Other kinds have the level INFO."""
+"""Maps the kind of an event to its level in the ROS log. Other kinds have the level INFO."""
 NUMBERS_BY_MODE_WORD = {word: float(mode) for mode, word in MODE_WORDS.items()}
-"""Number of each mode in messages for viewers, by the name of the mode in records."""
+"""Maps the name of each mode in records to its number in messages for viewers."""
 _MODE_NUMBERS: dict[Mode | str, float] = {mode: float(mode) for mode in MODE_WORDS}
 _MODE_NUMBERS.update(NUMBERS_BY_MODE_WORD)
 """Number of a mode, which is a `Mode` in a `TickRecord` and a word in a `State`."""
 
 
 def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
-    """Encodes an event for viewers as two messages: a string, and a line for the ROS log.
+    """Encodes an event for viewers as two messages: a string, and a line of the ROS log.
 
     Args:
         event: The event, such as the loss of a connection.
@@ -171,21 +172,21 @@ def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
 class _ArrayChannel:
     """A channel for viewers whose messages are arrays of a fixed shape.
 
-    The messages have the ROS type `std_msgs/msg/Float64MultiArray`.
+    The messages are of ROS type `std_msgs/msg/Float64MultiArray`.
 
     Args:
         content: Description of the numbers.
         unit: Unit of the numbers.
-        entry_names: For each axis of the array, the names of the entries along it.
+        entry_names: For each dimension of the array, the names of the entries along it.
 
     Attributes:
         channel: Description of the channel, with its metadata.
         size: Number of entries of an array.
-        pack: Function that encodes an array, from its numbers row by row.
+        pack: Function that encodes an array, given its entries row by row.
     """
 
     def __init__(self, content: str, unit: str, *entry_names: Sequence[str]) -> None:
-        """Describes a channel of number arrays, and prepares the encoding of its messages."""
+        """Describes a channel of arrays, and prepares the encoding of its messages."""
         joined_names = [" ".join(axis_entries) for axis_entries in entry_names]
         metadata = {
             "content": content,
@@ -204,33 +205,32 @@ class _ArrayChannel:
 
 
 ArrayChannels = dict[str, _ArrayChannel]
-"""Array channels by the last part of their topic."""
+"""Maps the last part of the topic of each array channel to the channel."""
 
 
 class Ros2SiteChannels:
     """Describes the ROS 2 channels of one site for viewers, and encodes arrays of numbers.
 
-    A site is a process that runs one arm. The other sites, its peers, have the order of the
-    scenario.
+    Peers are in scenario order.
 
     Args:
-        scenario: Scenario (description of the experiment) of the session.
+        scenario: Scenario of the session.
         site: Name of the site.
 
     Attributes:
         joints: Names of the joints, from the URDF or numbered for a planar arm.
-        arrays: The array channels, by the last part of their topic.
-        record_arrays: Names of the arrays that are computed from records (results of control
-            periods). The others are computed from statistics.
-        error_row: Slice of the error e = q - q_des, Eq. (9), in the numbers of a record from
-            `stack_signals`.
-        slow_row: Slice of the numbers that follow the error: the exogenous torque, the
-            estimated parameters, the vectors that the control law sends, and the mode.
+        arrays: Maps the last part of the topic of each array channel to the channel.
+        record_arrays: Names of the arrays that are computed from records. The others are
+            computed from statistics.
+        error_row: Slice of the error e = q - q_des, Eq. (9), in the values that `stack_signals`
+            returns for a record.
+        slow_row: Slice of the values after the error: the exogenous torque, the estimated
+            parameters, the vectors that the control law sends, and the mode.
         robot: Model of the arm for viewers. None for a planar arm.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        """Describes all ROS 2 channels of a site (arm controller) and of its network links."""
+        """Describes all ROS 2 channels of a site and of its network links."""
         arm = scenario.arms[site]
         self._arm = arm
         self._peers = scenario.peers(site)
@@ -267,7 +267,7 @@ class Ros2SiteChannels:
         }
 
     def _make_error_array(self) -> _ArrayChannel:
-        """Returns the array channel of the synchronisation error of the pose or the joints."""
+        """Returns the array channel for the synchronisation error of the pose or the joints."""
         if self._arm.shares_pose:
             shared = self._arm.counts.shared
             axes = TASK_AXES[:shared]
@@ -277,7 +277,7 @@ class Ros2SiteChannels:
         return _ArrayChannel("q - q_des", units, labels)
 
     def _make_estimate_array(self) -> _ArrayChannel:
-        """Returns the array of the estimated parameters of the arm."""
+        """Returns the array channel for the estimated parameters of the arm."""
         labels = _make_labels(name for name, _ in self._arm.parameters)
         if self._arm.chain is not None:
             return _ArrayChannel("estimate", "kg, kg m, kg m^2", labels)
@@ -285,7 +285,7 @@ class Ros2SiteChannels:
         return _ArrayChannel("estimate of Eq. (24)", units, labels)
 
     def _make_statistics_arrays(self) -> ArrayChannels:
-        """Returns the arrays that are computed from the statistics of links."""
+        """Returns the array channels that are computed from link statistics."""
         peers = self._peers
         return {
             "link_age": _ArrayChannel("age of the sample in use", "ms", peers),
@@ -302,10 +302,10 @@ class Ros2SiteChannels:
 
     @property
     def channels(self) -> dict[str, Ros2Channel]:
-        """ROS 2 channels of this site for viewers, by the last part of their topic.
+        """Maps the last part of each topic to the ROS 2 channel of this site for viewers.
 
-        There is a channel for each array of numbers. If the arm has a robot model, there are
-        also channels for the model and for the poses of its links.
+        There is one channel per array of numbers. If the arm has a robot model, there are also
+        channels for the model and for the poses of its links.
         """
         channels: dict[str, Ros2Channel] = {}
         for name, array in self.arrays.items():
@@ -315,7 +315,7 @@ class Ros2SiteChannels:
         return channels
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
-        """Returns a channel of joint states, the usual message with the joints of a robot.
+        """Returns a channel of joint states, the usual message for the joints of a robot.
 
         Args:
             names: Names of the joints.
@@ -347,12 +347,12 @@ class Ros2SiteChannels:
     def pack_slow_arrays(self, row: Sequence[float]) -> NamedMessages:
         """Encodes the quantities of a record that viewers receive at a reduced rate.
 
-        These are the exogenous torque of Eq. (8), the estimated parameters, the numbers that
+        These are the exogenous torque of Eq. (8), the estimated parameters, the vectors that
         the control law sends, and the mode.
 
         Args:
-            row: Values of these quantities: the slice `slow_row` of the numbers that
-                `stack_signals` returns for a record (result of a control period).
+            row: Values of these quantities: the slice `slow_row` of the values that
+                `stack_signals` returns for a record.
 
         Yields:
             The name of each array, and the encoded message.
@@ -366,11 +366,12 @@ class Ros2SiteChannels:
             start = end
 
     def pack_statistics(self, stats: LinkStats) -> NamedMessages:
-        """Encodes the statistics about the connections of a site to other sites as arrays.
+        """Encodes the statistics of a site's connections to its peers as arrays.
 
-        The age of the received states is always included. Delays, clock offsets and the timing
+        The age of the received samples is always included. Delays, clock offsets and the timing
         of the control loop are included only in a live session, because simulated time has no
-        such quantities. Nothing is yielded for a site that receives samples of no other site.
+        such quantities. Nothing is yielded for a site that receives no samples from any other
+        site.
 
         Args:
             stats: The statistics.
@@ -412,7 +413,7 @@ class Ros2SiteChannels:
 
 
 def _make_labels(names: Iterable[str]) -> list[str]:
-    """Returns names with underscores in place of spaces, because spaces separate labels."""
+    """Replaces spaces in names with underscores, because spaces separate labels."""
     labels: list[str] = []
     for name in names:
         parts = name.split()
@@ -421,10 +422,10 @@ def _make_labels(names: Iterable[str]) -> list[str]:
 
 
 def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
-    """Returns an array channel for each vector that a site's control law sends.
+    """Returns one array channel for each vector that a site's control law sends.
 
-    They have the order of the vectors in a record (result of a control period). A vector for a
-    single receiver (peer) has the name of the receiver in its topic.
+    The channels are in the order of the vectors in a record. The topic of a vector for a single
+    receiver (peer) contains the name of the receiver.
     """
     arrays: ArrayChannels = {}
     peers = scenario.peers(site)
@@ -445,31 +446,31 @@ def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
 
 
 def _convert_to_ms(us: int) -> float:
-    """Converts a time to ms. The value -1, a time that was not measured, becomes NaN."""
+    """Converts a time from us to ms. -1, which represents a missing value, becomes NaN."""
     return us / 1e3 if us != -1 else math.nan
 
 
 Record = State | TickRecord
-"""A record as a site publishes it, or as the kernel returns it."""
+"""A record as published by a site or as returned by the kernel."""
 SignalRow = Sequence[float]
 """The values of all curves at one time, or the values of one curve at all times."""
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Collects the curves that viewers draw from some records of an arm controller (site).
+    """Collects from the records of a site the curves that viewers draw.
 
     The curves are the joint positions q, their references q_des, the velocities qd, the torques
     tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
-    theta_hat, the numbers that the control law sends, and the mode. If the sites share the pose
-    x of the end effector instead, the joints have no reference. Then q is repeated in place of
-    q_des, and e is x - x_des.
+    theta_hat, the vectors that the control law sends, and the mode. If the sites share the pose
+    x of the end effector instead, the joints have no reference. In that case q is repeated in
+    place of q_des, and e is x - x_des.
 
     Args:
         records: The records, at least one.
 
     Returns:
-        The values of each curve, one per record. The mode has a single value if all records
-        have the same mode.
+        The values of each curve, one per record. The mode has a single value if it is the same
+        in all records.
     """
     first = records[0]
     is_task_space = bool(first.x)
@@ -503,7 +504,7 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
 
 
 def _transpose(rows: Iterable[SignalRow]) -> list[SignalRow]:
-    """Returns the columns of a table as rows: one sequence per curve, not per record."""
+    """Transposes a table, returning one sequence per curve instead of one per record."""
     return [*zip(*rows, strict=True)]
 
 
@@ -520,9 +521,9 @@ def _compute_errors(
 
 
 def _list_modes(records: Sequence[Record]) -> list[float]:
-    """Returns the operating mode of each record as a number, or one number if all are equal.
+    """Returns the mode of each record as a number, or one number if all are equal.
 
-    Equal modes have equal extremes, for which a single number suffices.
+    If all modes are equal, their extremes are equal too, and a single number suffices.
     """
     modes = [record.mode for record in records]
     first_mode = modes[0]

@@ -1,9 +1,9 @@
-"""Writes the configuration with which RViz, the 3D viewer of ROS 2, shows a session's arms.
+"""Writes a configuration for RViz, the 3D viewer of ROS 2, that shows the arms of a session.
 
-The configuration is a YAML file that states which displays are shown, and of which topics. It
-has a display for the model of each arm and for each pose, and also shows the frames of all
-links and a grid. The same file serves a running session that the live bridge publishes, and an
-exported bag of this session, because both have the same topics.
+The configuration is a YAML file that lists the displays and their topics. There is one display
+for the model of each arm and for each pose, and others for the frames of all links and a grid.
+The same file works for a running session published by the live bridge and for an exported bag
+of this session, because both have the same topics.
 
 Invariant:
     - An existing file is replaced only with `force`.
@@ -27,20 +27,20 @@ from .robot_model import SPACING_M, WORLD
 from .ros2_messages import Ros2Channel
 
 _SUFFIX = ".rviz"
-"""Suffix of the templates, and of configurations."""
+"""Suffix of the file names of templates and configurations."""
 
 
 def write_rviz_config(log: Path, *, force: bool = False) -> Path:
-    """Writes a configuration of RViz, the 3D viewer of ROS, that shows the arms of a log.
+    """Writes a configuration for RViz, the 3D viewer of ROS 2, that shows the arms of a log.
 
-    A log is shown while its session is running over ROS, and a bag while it is played.
+    RViz shows a log while its session runs over ROS, and a bag while it is played back.
 
     Args:
-        log: File of the log or bag.
-        force: True to replace an existing file.
+        log: Path of the log or bag.
+        force: True to allow replacing an existing file.
 
     Returns:
-        The path of the configuration, which is beside the log.
+        The path of the configuration, which is next to the log.
 
     Raises:
         UsageError: The bag contains no description of an arm, or the configuration exists.
@@ -60,7 +60,7 @@ def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
     """Returns settings with which the viewer RViz shows the arms of a session or a bag.
 
     Args:
-        topics: Descriptions of the topics by their full names, which begin with /.
+        topics: Maps the full name of each topic, which begins with "/", to its description.
 
     Raises:
         UsageError: The topics describe no arm.
@@ -93,10 +93,10 @@ def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
 
 
 def _fill_template(template: str, **values: str) -> str:
-    """Returns a text in which placeholders are replaced by values.
+    """Returns the text of a template with its placeholders replaced.
 
     Args:
-        template: Name of the file of the template, without its suffix.
+        template: Name of the template file, without its suffix.
         **values: Value of each placeholder.
     """
     text = (DEFINITIONS / f"{template}{_SUFFIX}").read_text(encoding="utf-8")

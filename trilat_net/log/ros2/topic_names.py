@@ -1,12 +1,12 @@
 """Defines the names of a session's topics in ROS 2, for the live bridge and for bags.
 
-The live bridge publishes a running session as topics of ROS 2, the Robot Operating System. A
-bag is a recording of such topics, into which a log can be converted. The user chooses one of
-two conventions for the names, or changes names with a TOML file.
+The live bridge publishes a running session as ROS 2 topics. A bag is a recording of such
+topics, to which a log can be converted. The user chooses one of two naming conventions, or
+overrides names in a TOML file.
 
 Invariant:
-    - A name that begins with / is a full name. Other names are below `/<session>/<site>`, where
-      the site is the process that controls one arm.
+    - A name that begins with / is a full name. Any other name is relative to
+      `/<session>/<site>`.
     - No two topics have the same name.
     - A topic has the same name in a bag as in the live bridge.
 """
@@ -52,27 +52,29 @@ TOPICS = {
     "robot_states": ("robot/joint_states", "robot/measured_js"),
     "robot_commands": ("robot/commands", "robot/commands"),
 }
-"""Name of each topic below `/<session>/<site>` in each of `NAMINGS`, by its name in trilat-net.
+"""Maps the trilat-net name of each topic to its name below `/<session>/<site>` in each of
+`NAMINGS`.
 
 CRISP is a set of ROS 2 controllers. CRTK is the convention of the da Vinci Research Kit. A
-vector that a control law sends has the same name in both: "sent_" and the name of the vector.
+vector that a control law sends has the same name in both: "sent_" followed by the name of the
+vector.
 """
 FRAMES_TOPIC = "tf"
-"""Topic with the poses of all links, under the name that tools of ROS expect."""
+"""Topic for the poses of all links, with the name that ROS tools expect."""
 DIAGNOSTICS = "diagnostics"
-"""Topic with the status of all sites, under the name that tools of ROS expect."""
+"""Topic for the status of all sites, with the name that ROS tools expect."""
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings of a real robot that is the arm of a site, from the user's file of names.
+    """Settings of a real robot that serves as the arm of a site, from the user's file of names.
 
     Attributes:
-        joints: Names of the joints in the robot's messages, in the order of the scenario. If
-            empty, the names are those of the scenario.
+        joints: Names of the joints in the robot's messages, in scenario order. If empty, the
+            names of the scenario are used.
         controller: The same names in the order in which the robot's controller expects its
-            commands. If empty, the order is that of the scenario.
-        safe: Command to the controller while the arm brakes, a number per joint in the order of
-            the controller. If empty, it is zero.
+            commands. If empty, scenario order is used.
+        safe: Command sent to the controller while the arm brakes, one number per joint in the
+            order of the controller. If empty, zeros are sent.
     """
 
     joints: list[str] = []
@@ -84,10 +86,10 @@ class TopicTable(NamedTuple):
     """Names of a session's topics in ROS 2, as chosen by the user.
 
     Attributes:
-        names: Name of each topic in ROS 2, by its name in trilat-net.
-        of_site: Names that differ at a site (arm controller), by name of the site and by the
-            name in trilat-net.
-        robots: Settings of the real robots, by name of the site.
+        names: Maps the trilat-net name of each topic to its ROS 2 name.
+        of_site: For each site that differs, maps the trilat-net name of a topic to its ROS 2
+            name.
+        robots: Maps the names of sites with a real robot to the settings of the robot.
     """
 
     names: Mapping[str, str]
@@ -95,19 +97,18 @@ class TopicTable(NamedTuple):
     robots: Mapping[str, RobotTable] = {}
 
     def refuse_other_robots(self, scenario: Scenario) -> None:
-        """Checks that each robot belongs to a site with an external arm of as many joints.
+        """Raises UsageError unless each robot belongs to a site with a matching external arm.
 
-        An external arm is a real arm, or a simulation in another program. The settings of a
-        robot have a meaning only for a site with such an arm. Settings that equal the defaults
-        are tolerated for other sites of the scenario, because they have no effect.
+        An external arm is a real arm, or a simulation in another program, and settings of a
+        robot only make sense for a site that has one. Settings that equal the defaults are
+        tolerated at other sites of the scenario, because they have no effect.
 
         Args:
             scenario: Scenario of the session.
 
         Raises:
-            UsageError: A site without an external arm has settings of a robot, the scenario has
-                no such site, or the robot has another number of joints than the arm of its
-                site.
+            UsageError: A site without an external arm has robot settings, the scenario has no
+                such site, or the robot does not have as many joints as the arm of its site.
         """
         for site, robot in self.robots.items():
             has_external_arm = site in scenario.outside
@@ -131,13 +132,13 @@ class TopicTable(NamedTuple):
                     )
 
     def find(self, session: str, site: str, topic: str) -> str:
-        """Returns the full name of a site's topic in ROS 2, without the first /.
+        """Returns the full ROS 2 name of a site's topic, without the leading slash.
 
-        The user's names have precedence over the names of trilat-net.
+        The user's names take precedence over those of trilat-net.
 
         Args:
             session: Name of the session.
-            site: Name of the site (arm controller).
+            site: Name of the site.
             topic: Name of the topic in trilat-net.
         """
         common_name = self.names.get(topic, topic)
@@ -149,13 +150,13 @@ class TopicTable(NamedTuple):
 
     @classmethod
     def read(cls, source: str) -> "TopicTable":
-        """Reads the names under which the topics of a session should appear in ROS 2.
+        """Reads the ROS 2 names for the topics of a session.
 
         The names follow a built-in convention, or come from a TOML file. The conventions are
         "crisp" (a set of ROS 2 controllers) and "crtk" (the Collaborative Robotics Toolkit).
-        The file states only the names that differ from "crisp". For example, the line
-        `joint_states = "arm/joint_states"` applies to all sites (arm controllers). A table
-        `[sites.s]` applies only to the site `s`. It may also contain the settings of a real
+        The file lists only the names that differ from "crisp". For example, the line
+        `joint_states = "arm/joint_states"` applies to all sites, whereas a table `[sites.s]`
+        applies only to the site `s`. Such a table may also contain the settings of a real
         robot, which are the fields of `RobotTable`.
 
         Args:
@@ -165,7 +166,7 @@ class TopicTable(NamedTuple):
             The names, and the settings of real robots.
 
         Raises:
-            UsageError: The file cannot be read, or a name in it is not valid.
+            UsageError: The file cannot be read, or contains an invalid name.
         """
         if source in NAMINGS:
             return TopicTable(_list_names(source))
@@ -180,9 +181,9 @@ class TopicTable(NamedTuple):
 
 
 def make_session_name(text: str) -> str:
-    """Converts the name of a session to a name that ROS 2 accepts.
+    """Converts the name of a session to a valid ROS 2 name.
 
-    Characters that ROS 2 does not allow in names become _.
+    Characters that are not allowed in ROS 2 names are replaced with underscores.
 
     Args:
         text: Name of the session.
@@ -198,7 +199,7 @@ def _list_names(naming: str) -> dict[str, str]:
 
 
 def _read_names_file(source: str) -> TopicTable:
-    """Reads a user's file with names of ROS 2 topics and with settings of robots.
+    """Reads a user's file with names of ROS 2 topics and settings of robots.
 
     Raises:
         UsageError: The file cannot be read, or is not valid TOML.
@@ -226,11 +227,11 @@ def _read_names_file(source: str) -> TopicTable:
 
 
 def _check_names(source: str, names: Mapping[str, object]) -> None:
-    """Checks that the topics that a user renamed exist, and that ROS 2 permits the new names.
+    """Raises UsageError if a renamed topic does not exist or its new name is invalid in ROS 2.
 
     Args:
         source: Name of the file, for the error message.
-        names: Names in ROS 2, by the name in trilat-net.
+        names: Maps names in trilat-net to names in ROS 2.
 
     Raises:
         UsageError: A topic does not exist, or a name is not valid.
@@ -246,7 +247,7 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
 
 
 def _check_unique_names(source: str, table: TopicTable) -> None:
-    """Checks that no two quantities have the same topic name in ROS 2.
+    """Raises UsageError if two quantities have the same topic name in ROS 2.
 
     Args:
         source: Name of the file, for the error message.

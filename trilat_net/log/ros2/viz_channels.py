@@ -1,12 +1,12 @@
 """Writes the curves of a run for general viewers, with fewer points than the log.
 
-Each arm publishes its state typically 1000 times a second, more than a viewer such as Foxglove
-can draw smoothly. Therefore the states are collected in buckets, intervals of equal length. A
-bucket becomes two messages of ROS 2, which contain the minimum and the maximum of each curve in
-the bucket, in the order in which the two occurred. Thus no peak is lost.
+An arm typically publishes its state 1000 times a second, more than a viewer such as Foxglove
+can draw smoothly. The states are therefore collected in buckets, intervals of equal length. A
+bucket becomes two ROS 2 messages, which contain the minimum and the maximum of each curve in
+the bucket, in the order in which the two occurred. No peak is lost.
 
-The joints and their error appear in `views_hz` messages a second. The external torque, the
-estimated parameters and the mode appear in only `SLOW_VIZ_HZ` messages a second.
+The joints and their error appear in `views_hz` messages per second. The external torque, the
+estimated parameters and the mode appear in only `SLOW_VIZ_HZ` messages per second.
 
 Invariant:
     - The file contains the exact minimum and maximum of every curve in every bucket.
@@ -32,32 +32,35 @@ from .ros2_messages import Record, Ros2Channel, SignalRow
 SLOW_VIZ_HZ = 10.0
 """Rate of the messages with exogenous torque, estimate and mode, in Hz.
 
-If there is a message for every record with the joints, the same applies to these channels.
+If every record results in a message with the joints, the same applies to these channels.
 """
 MAX_PENDING_BYTES = 1 << 13
-"""Largest size of a site's messages that are not written yet, in bytes, for two joints."""
+"""Maximum size of a site's messages that are still to be written, in bytes, for two joints."""
 SENT_PENDING_BYTES = 512
 """Additional size for each number that the site's control law sends, in bytes. Each number may
 be a separate array.
 """
 
 StampedRow = tuple[int, SignalRow]
-"""Time in Unix ns, and the values of all curves at this time."""
+"""Time in Unix time, in ns, and the values of all curves at this time."""
 WriteRow = Callable[[int, SignalRow, int], None]
-"""Function that writes the values of all curves at one time: time, values, arrival time."""
+"""Function that writes the values of all curves at one time, given the time, the values and the
+arrival time.
+"""
 
 _get_tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Writes two messages for each time interval: at its end, and half an interval later.
+    """Writes two messages per time interval: at its end, and half an interval later.
 
     A message contains the values of all curves of a viewer at one time (a row). An interval is
     called a bucket. The second row is written by `flush`, or before the first row of the next
     bucket.
 
     Args:
-        write: Function that writes a row: time, values, and arrival time in Unix ns.
+        write: Function that writes a row, given its time, its values, and the arrival time in
+            Unix time, in ns.
     """
 
     def __init__(self, write: WriteRow) -> None:
@@ -65,15 +68,15 @@ class _BucketOutput:
         self._waiting_rows: Sequence[StampedRow] = ()
 
     def add(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes the first row of a time interval at once, and keeps the second row for later.
+        """Writes the first row of a time interval immediately, and keeps the second for later.
 
-        A row contains one value of each curve. The two rows of an interval contain the minimum
-        and the maximum of each curve. If the second row of the previous interval is still kept,
-        that row is written first.
+        A row contains one value per curve. The two rows of an interval contain the minimum and
+        the maximum of each curve. If the second row of the previous interval is still pending,
+        it is written first.
 
         Args:
-            rows: The rows with their times, one or two.
-            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+            rows: One or two rows with their times.
+            log_ns: Arrival time to store in the log with the messages, in Unix time, in ns.
         """
         self.flush(log_ns)
         stamp_ns, row = rows[0]
@@ -81,47 +84,46 @@ class _BucketOutput:
         self._waiting_rows = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        """Writes the second message of a time interval, if it was not written yet.
+        """Writes the second message of a time interval, if it is still pending.
 
-        `add` has stored its curve values, so that messages are evenly spaced in time.
+        `add` has kept its curve values back, so that messages are evenly spaced in time.
 
         Args:
-            log_ns: Arrival time that the log states for the message, in Unix time, in ns.
+            log_ns: Arrival time to store in the log with the message, in Unix time, in ns.
         """
         self.write_all(self._waiting_rows, log_ns)
         self._waiting_rows = ()
 
     def write_all(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes all rows of curve values of a time interval at once.
+        """Writes all rows of a time interval at once.
 
-        This is used for an interval whose records (results of control periods) arrived late.
-        Otherwise `add` spreads the rows over time.
+        Used for an interval whose records arrived late. Otherwise `add` spreads the rows over
+        time.
 
         Args:
             rows: The rows with their times.
-            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+            log_ns: Arrival time to store in the log with the messages, in Unix time, in ns.
         """
         for stamp_ns, row in rows:
             self._write(stamp_ns, row, log_ns)
 
 
 class _SiteBuckets:
-    """The buckets of one site (arm controller).
+    """The buckets of one site.
 
-    A fast bucket contains records (results of control periods), and becomes two messages with
-    the joints. A slow bucket contains the rows of several fast buckets, and becomes two
-    messages with the other curves.
+    A fast bucket contains records, and becomes two messages with the joints. A slow bucket
+    contains the rows of several fast buckets, and becomes two messages with the other curves.
 
     Args:
         scenario: Scenario of the session.
         site: Name of the site.
         views_hz: Rate of the messages with the joints, in Hz.
-        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
         put: Function that writes a message.
 
     Attributes:
-        channels: Channels of the site, by topic.
-        max_pending_bytes: Largest size of the messages that are not written yet, in bytes.
+        channels: Maps the topic of each channel of the site to its description.
+        max_pending_bytes: Maximum size of the messages that are still to be written, in bytes.
     """
 
     def __init__(
@@ -194,11 +196,11 @@ class _SiteBuckets:
         file. The file itself is written before the first frames.
 
         Args:
-            stamp_ns: Time of the values, in Unix time, in ns.
+            stamp_ns: Time of the values in Unix time, in ns.
             row: Values of all curves at this time, see `ros2_messages.stack_signals`. For n
                 joints it begins with the positions, the references, the velocities and the
-                efforts (torques), n numbers each.
-            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+                efforts (torques), each with n entries.
+            log_ns: Arrival time to store in the log with the messages, in Unix time, in ns.
         """
         n = self._joint_count
         positions_and_references = row[: 2 * n]
@@ -231,29 +233,29 @@ class _SiteBuckets:
     def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         """Writes the quantities that viewers need less often than the joints.
 
-        They are the external torque, the estimate of the arm, the numbers that the law sends,
+        These are the external torque, the estimate of the arm, the vectors that the law sends,
         and the mode.
         """
         for name, data in self._site_channels.pack_slow_arrays(row):
             self._write_message(name, data, stamp_ns, log_ns)
 
     def _write_message(self, name: str, data: bytes, stamp_ns: int, log_ns: int) -> None:
-        """Writes a message to the channel with a name, the last part of the topic."""
+        """Writes a message to the channel whose topic ends in a given name."""
         topic = self._topics[name]
         self._put(topic, data, stamp_ns, log_ns)
 
     def add_record(self, record: Record, log_ns: int) -> None:
-        """Adds a record of the site, and writes the messages that are complete now.
+        """Adds a record of the site, and writes the messages that this completes.
 
-        Records (results of control periods) are collected in buckets, intervals of equal
-        length. A bucket becomes two messages with the minimum and the maximum of each curve. To
-        space the messages evenly, a bucket has two halves: when the first record of another
-        bucket arrives, the first message of the previous bucket is written. When a record of
-        the second half arrives, the second message of that previous bucket is written.
+        Records are collected in buckets, intervals of equal length. A bucket becomes two
+        messages with the minimum and the maximum of each curve. To space the messages evenly,
+        the first message of a bucket is written when the first record of another bucket
+        arrives, and the second one when a record in the second half of that other bucket
+        arrives.
 
         Args:
             record: The record.
-            log_ns: Arrival time, in Unix time, in ns.
+            log_ns: Arrival time in Unix time, in ns.
         """
         tick = record.tick
         is_bucket_written = tick < self._first_tick
@@ -273,10 +275,10 @@ class _SiteBuckets:
         self._records.append(record)
 
     def _add_late_record(self, record: Record, log_ns: int) -> None:
-        """Keeps a record whose bucket was written already, because the record arrived late.
+        """Stores a record that arrived after its bucket was written.
 
-        Late records (results of control periods) of one bucket are collected, and written as
-        soon as a late record of another bucket arrives.
+        Late records of one bucket are collected, and written as soon as a late record of
+        another bucket arrives.
         """
         bucket = record.tick // self._bucket_ticks
         if self._late_records:
@@ -288,31 +290,30 @@ class _SiteBuckets:
     def add_statistics(self, stats: LinkStats, log_ns: int) -> None:
         """Writes statistics about the connections of the site as messages for viewers.
 
-        The statistics are not reduced, because a site (arm controller) publishes them only ten
-        times a second.
+        The statistics are not thinned out, because a site publishes them only ten times a
+        second.
 
         Args:
             stats: The statistics.
-            log_ns: Arrival time, in Unix time, in ns.
+            log_ns: Arrival time in Unix time, in ns.
         """
         stamp_ns = max(0, self._epoch_unix_ns + stats.t_ns)
         for name, data in self._site_channels.pack_statistics(stats):
             self._write_message(name, data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes the messages for all records that were added but not written yet.
+        """Writes the messages for all records that were added but not yet written.
 
-        The method is called at the end of the log.
+        Called at the end of the log.
 
-        The records (results of control periods) of a site (arm controller) are collected in
-        time intervals of equal length, the fast buckets. The extremes of `_slow_ratio`
-        successive fast buckets are collected in a slow bucket. Each bucket becomes two
-        messages: the first one is written when the bucket is closed, and the second one half a
-        bucket later. Two objects store the second message until then, one for fast and one for
-        slow buckets.
+        The records of a site are collected in time intervals of equal length, the fast buckets.
+        The extremes of `_slow_ratio` successive fast buckets are collected in a slow bucket.
+        Each bucket becomes two messages: the first is written when the bucket is closed, and
+        the second half a bucket later. Until then, the second message is kept by one of two
+        objects, one for fast and one for slow buckets.
 
         Args:
-            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+            log_ns: Arrival time to store in the log with the messages, in Unix time, in ns.
         """
         # A bucket is closed when a later one is opened. A fast bucket that belongs to a later
         # slow bucket closes both kinds. The next slow bucket would suffice, but one more
@@ -326,17 +327,16 @@ class _SiteBuckets:
     def _close_bucket(self, next_bucket: int, log_ns: int) -> None:
         """Reduces the records of the open bucket to two messages, and opens another bucket.
 
-        The first message is written now, and the second one half a bucket later
-        (`_BucketOutput`). Records (results of control periods) of older buckets that arrived
-        late are written first.
+        The first message is written now, and the second half a bucket later (`_BucketOutput`).
+        Late records of older buckets are written first.
 
         The slow curves, such as the estimate, are reduced a second time: a slow bucket consists
         of `_slow_ratio` fast buckets, and contains their extremes. It also becomes two
-        messages, the first one at its end and the second one half a slow bucket later.
+        messages, the first written at its end and the second half a slow bucket later.
 
         Args:
-            next_bucket: Number of the bucket that is opened, counted from tick 0.
-            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+            next_bucket: Number of the bucket to open, counted from tick 0.
+            log_ns: Arrival time to store in the log with the messages, in Unix time, in ns.
         """
         self._flush_late_records(log_ns)
         if self._records:
@@ -365,10 +365,10 @@ class _SiteBuckets:
         self._first_tick = self._bucket_ticks * next_bucket
 
     def _flush_late_records(self, log_ns: int) -> None:
-        """Writes for viewers the records that arrived after their interval was written.
+        """Writes the records that arrived after their bucket was written.
 
-        As for other intervals (buckets), the minimum and the maximum of each curve are written,
-        here on the fast and on the slow channels at once.
+        As for other buckets, the minimum and the maximum of each curve are written, here to the
+        fast and slow channels at once.
         """
         if self._late_records:
             rows = self._decimate(self._late_records)
@@ -378,10 +378,10 @@ class _SiteBuckets:
             self._late_records = []
 
     def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
-        """Returns the values of curves that need fewer points per second than the joint angles.
+        """Selects the values of curves that need fewer points per second than the joint angles.
 
         Args:
-            rows: Values of all curves at some times.
+            rows: Values of all curves, one row per time.
         """
         slow_row = self._site_channels.slow_row
         return [(stamp_ns, row[slow_row]) for stamp_ns, row in rows]
@@ -389,13 +389,12 @@ class _SiteBuckets:
     def _decimate(self, records: list[Record]) -> list[StampedRow]:
         """Reduces the records of a bucket to the minimum and the maximum of each curve.
 
-        A bucket is a time interval. Its two rows get the times at the beginning and in the
-        middle of the interval, so that the rows of successive buckets are evenly spaced. The
-        extremes of different curves occur at different times. Therefore no exact time exists.
+        A bucket is a time interval. The extremes of different curves occur at different times,
+        so the two rows have no exact time. They are stamped with the beginning and the middle
+        of the interval, which spaces the rows of successive buckets evenly.
 
         Args:
-            records: The records (results of control periods) of the bucket, at least one. They
-                are sorted by time in place.
+            records: The records of the bucket, at least one. Sorted by time in place.
 
         Returns:
             Two rows with their times, or one row for a single record.
@@ -418,16 +417,16 @@ class _SiteBuckets:
 def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> list[StampedRow]:
     """Reduces the curves of a time interval to two rows: the extremes of each curve.
 
-    A row contains one value of each curve at one time. The first row contains the extreme of
-    each curve (minimum or maximum) that occurs first, and the second row the other extreme.
+    A row contains one value per curve. The first row contains the extreme of each curve
+    (minimum or maximum) that occurs first, and the second row the other extreme.
 
-    The extremes of different curves occur at different times. Therefore no exact time of a row
-    exists. The rows get the times at the beginning and in the middle of the interval instead,
-    so that the rows of successive intervals are evenly spaced.
+    The extremes of different curves occur at different times, so the rows have no exact time.
+    They are stamped with the beginning and the middle of the interval, which spaces the rows of
+    successive intervals evenly.
 
     Args:
-        stamps_ns: Times of the values in the interval, in Unix time, in ns. At least one.
-        curves: For each curve its values in the interval, in the order of time.
+        stamps_ns: Times of the values in the interval in Unix time, in ns, at least one.
+        curves: For each curve its values in the interval, in chronological order.
 
     Returns:
         The two rows, each with its time. Only one row if there is a single time.
@@ -442,22 +441,23 @@ def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> li
 
 
 class VizChannels:
-    """Writes messages for general viewers into a log, next to the messages of the session.
+    """Writes messages for general viewers to a log, next to the messages of the session.
 
-    Viewers such as Foxglove cannot decode or draw all messages of a session. They get standard
-    ROS 2 messages with fewer points, which keep the minimum and maximum of each interval.
+    Viewers such as Foxglove cannot decode or draw all messages of a session. They are given
+    standard ROS 2 messages with fewer points, which preserve the minimum and maximum of each
+    interval.
 
     Args:
         scenario: Scenario of the session.
         session: Name of the session.
-        epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
-        views_hz: Rate of the messages with the joints, in Hz. `FULL_RATE_HZ` writes a message
-            for every record (result of a control period).
-        put: Function that writes a message into the log.
+        epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
+        views_hz: Rate of the messages with the joints, in Hz. With `FULL_RATE_HZ`, one message
+            is written per record.
+        put: Function that writes a message to the log.
 
     Attributes:
-        channels: All channels that may occur, by topic.
-        receivers: Functions that receive the messages of the session, by the key of the
+        channels: Maps the topic of each channel that may occur to its description.
+        receivers: Maps the key of messages of the session to the function that receives these
             messages.
     """
 
@@ -469,7 +469,7 @@ class VizChannels:
         views_hz: float,
         put: PutMessage,
     ) -> None:
-        """Prepares channels for viewers such as Foxglove. No message is written yet."""
+        """Prepares the channels for viewers such as Foxglove. No message is written yet."""
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
 
@@ -502,8 +502,8 @@ class VizChannels:
     def _add_event(self, event: Event, log_ns: int) -> None:
         """Writes an event of the session for viewers, as text and as a line for the ROS log.
 
-        An event from before the start of the session states no time. Its arrival time is used
-        instead.
+        An event from before the start of the session states no time, so its arrival time is
+        used.
         """
         stamp_ns = log_ns
         if event.t_ns >= 0:
@@ -512,13 +512,13 @@ class VizChannels:
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes the remaining messages for viewers, at the end of the log.
+        """Writes the remaining messages for viewers at the end of the log.
 
-        Messages for viewers are otherwise written when the time interval that they cover is
+        Before that, a message for viewers is written when the time interval that it covers is
         over.
 
         Args:
-            log_ns: Arrival time of the last message of the session, in Unix time, in ns.
+            log_ns: Arrival time of the last message of the session in Unix time, in ns.
         """
         for buckets in self._buckets:
             buckets.finish(log_ns)
@@ -529,13 +529,13 @@ class VizChannels:
         A channel is registered in the file only when its first message is written.
 
         Args:
-            file: The file.
+            file: Writer of the MCAP file.
         """
         return ros2_messages.StandardChannels(file, self.channels)
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound for the size of the messages that are not written yet, in bytes.
+        """Upper bound on the size of the messages that are still to be written, in bytes.
 
         The messages of a bucket are written when the bucket ends.
         """
@@ -545,18 +545,21 @@ class VizChannels:
 def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
     """Returns the function with which a `LogWriter` creates its messages for viewers.
 
-    The writer itself does not depend on ROS: it calls this function for each file of a log.
+    The writer itself does not depend on ROS. It calls this function for each file of a log.
 
     Args:
         scenario: Scenario of the session.
-        views_hz: Rate of the messages with the joints, in Hz, see `VizChannels`. If it is 0,
-            the log contains no messages for viewers.
+        views_hz: Rate of the messages with the joints, in Hz, see `VizChannels`. If 0, the log
+            contains no messages for viewers.
+
+    Returns:
+        The function, or None if `views_hz` is 0.
     """
     if not views_hz:
         return None
 
     def make_views(session: str, epoch_unix_ns: int, put: PutMessage) -> VizChannels:
-        """Prepares the messages for viewers, such as Foxglove, of one file of the log.
+        """Creates the object that writes one log file's messages for viewers such as Foxglove.
 
         Args:
             session: Name of the session.
@@ -569,16 +572,15 @@ def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
 
 
 def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[float]]:
-    """Reduces curves to two values each, their minimum and their maximum.
+    """Reduces each curve to two values, its minimum and its maximum.
 
-    The two values keep the order in which they occur, so that a drawn curve keeps its peaks.
+    The two values keep the order in which they occur, so that a plotted curve keeps its peaks.
 
     Args:
-        curves: Values of each curve in the order of time. They are finite, and there is at
-            least one.
+        curves: Values of each curve in chronological order, at least one. All are finite.
 
     Returns:
-        The extreme of each curve that occurs first, and the extreme of each curve that occurs
+        For each curve the extreme that occurs first, and for each curve the extreme that occurs
         second.
     """
     earlier: list[float] = []
