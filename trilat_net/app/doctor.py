@@ -279,7 +279,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
 
     Returns:
         For each rate that was tried: the rate in Hz, the lateness in us that
-        `MIN_PUNCTUAL_SHARE` of its ticks did not exceed, and the largest lateness in us.
+            `MIN_PUNCTUAL_SHARE` of its ticks did not exceed, and the largest lateness in us.
     """
     results: list[tuple[int, int, int]] = []
     for rate_hz in RATES_HZ:
