@@ -83,13 +83,14 @@ class InboundQueue:
     """Bounded queue of messages between the network threads and the writing thread.
 
     Messages wait here while the disk is slow. If the queue is full, a message is dropped and
-    counted, because an unbounded queue could use up the memory.
+    counted, because an unbounded queue could exhaust the memory.
 
     Args:
         clock: Clock that determines the times of arrival.
 
     Attributes:
-        overflowed: Mapping from key to the number of messages for which there was no space.
+        overflowed: Mapping from key to the number of messages that were dropped because the
+            queue was full.
     """
 
     def __init__(self, clock: Clock) -> None:

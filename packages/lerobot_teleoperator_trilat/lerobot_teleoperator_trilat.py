@@ -208,7 +208,7 @@ class TrilatTeleoperator(Teleoperator):
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm, so that only the person moves it and feedback has no effect.
+        """Releases the arm: the operator can move it freely, and force feedback has no effect.
 
         Call `enable_torque` to allow feedback again.
         """

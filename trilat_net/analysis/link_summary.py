@@ -549,12 +549,12 @@ class LinkSummary(NamedTuple):
 
 
 def bin_ages(age_ns: Ints) -> _AgeHistogram | None:
-    """Counts ages in a histogram of at most `MOST_AGE_BINS` bins.
+    """Builds a histogram of sample ages with at most `MOST_AGE_BINS` bins.
 
     The bin width is 1, 2 or 5 times a power of ten, and at least 10 microseconds.
 
     Args:
-        age_ns: Ages, shape (K,), in ns.
+        age_ns: Ages of the samples, shape (K,), in ns.
 
     Returns:
         The histogram, or `None` if there are no ages.

@@ -183,7 +183,7 @@ def certify(
 
 
 def metrics(log: AnyLog) -> LogMetrics:
-    """Measures the tracking, effort, energies, force sharing and network of a run.
+    """Computes the metrics of tracking, effort, energy, force sharing and the network of a run.
 
     The command is `trilat metrics`. docs/reference/metrics.md has the formula of every metric.
 

@@ -73,8 +73,8 @@ def ping_topic(
 class TopicDelays(Result):
     """Delays of the messages on a ROS 2 topic, for each program that publishes on the topic.
 
-    A delay is the time from the time stamp with which a message was sent to its arrival at this
-    process. Between two machines it contains the offset of their clocks.
+    A delay is the arrival time at this process minus the time stamp of the message. If the
+    sender is on another machine, the delay includes the offset between the two clocks.
 
     Attributes:
         topic: Name of the topic.

@@ -726,7 +726,7 @@ class RunningSession:
 
     @contextmanager
     def episode(self, name: str) -> Iterator[Callable[[bool], None]]:
-        """Marks an episode, a part of the run with a name, in the log, as a context manager.
+        """Marks a named part of the run (an episode) in the log. This is a context manager.
 
         The beginning and the end of the `with` block are stored as marks. Tools that read the
         log can then divide the run into episodes, for example one per attempt at a task.

@@ -142,7 +142,7 @@ class RerunRequest:
             closed_loop: If True, all sites are executed.
 
         Raises:
-            UsageError: The sites are not named, or are named in two ways.
+            UsageError: Both `replace` and `closed_loop` are given, or neither is.
             ScenarioError: There is no such site, or a change is invalid or cannot have an
                 effect.
         """

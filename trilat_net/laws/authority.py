@@ -135,14 +135,14 @@ class Authority(ControlLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:
         """Explains to the user which dominance factors of a user's arm have no effect.
 
-        With this law, the users' arms follow only each other, so the weight that a scenario
-        assigns to the slave is not used.
+        Under the control law of this arm, the users' arms follow only each other. The weight
+        that a scenario assigns to the slave is therefore not used.
 
         Args:
             situation: This arm, and the laws of all arms.
 
         Returns:
-            A sentence for the user. Empty if the site is the slave, or if all sites are users.
+            A sentence for the user. Empty if this arm is the slave, or if there is no slave.
         """
         idle = []
         for name, law in zip(situation.names, situation.laws, strict=True):

@@ -653,10 +653,10 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
-        """Names of the sites whose end was not recorded.
+        """Names of the sites whose shutdown was not recorded.
 
-        A site publishes the event "end" when it ends. Without this event, the site may have
-        executed more ticks than the log shows. Empty if the recorder was configured not to
+        A site publishes the event "end" when it shuts down. Without this event, the site may
+        have executed more ticks than the log shows. Empty if the recorder was configured not to
         record events.
         """
         is_one_of_several_parts = bool(self.part) and len(self.sources) == 1

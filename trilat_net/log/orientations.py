@@ -146,13 +146,13 @@ class RotationVectors:
         return np.asarray(turns + whole_turns)
 
     def without_jumps(self) -> Array:
-        """Computes rotation vectors of the same rotations that do not jump at half a turn.
+        """Unwraps the rotation vectors, so that they stay continuous at half a turn.
 
-        They may be up to a whole turn long, and jump there instead. The rotation vectors must
-        be in chronological order.
+        The unwrapped vectors represent the same rotations. They can be up to a full turn long,
+        and are discontinuous only there. The rotation vectors must be in chronological order.
 
         Returns:
-            Rotation vectors of the same rotations, shape (K, 3), in rad.
+            The unwrapped rotation vectors, shape (K, 3), in rad.
         """
         quaternions = self.as_quaternions()
         w = quaternions[:, :1]

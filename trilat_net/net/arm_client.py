@@ -124,7 +124,7 @@ class _SiteSender:
         return message
 
     def repeat(self, message: R) -> None:
-        """Repeats a message with its original number, showing that the program still runs.
+        """Resends a message with its original number, to show that the sender still runs.
 
         The site recognises the number and does not execute the message a second time.
 

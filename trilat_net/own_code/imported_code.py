@@ -207,8 +207,8 @@ class CodeKey(NamedTuple):
     def import_class(self, path: str, method: str = "torque") -> Any:
         """Imports a user's class from its permitted file.
 
-        The file must be the one that a person permitted, which is checked before any of its
-        code runs.
+        Before any code of the file runs, this method checks that the file is the one that the
+        user permitted.
 
         Args:
             path: Path of the key in the scenario, for error messages.

@@ -156,9 +156,9 @@ def print_line(text: str) -> None:
 
 
 def print_table(table: "TextTable") -> None:
-    """Prints a table, at most as wide as the terminal.
+    """Prints a table that fits the width of the terminal.
 
-    If the output is not a terminal, a width of at least `_PIPE_WIDTH` is available.
+    If the output is not a terminal, the table may be at least `_PIPE_WIDTH` columns wide.
 
     Args:
         table: The table.

@@ -21,14 +21,14 @@ from .key_checks import StructType, find_extra, list_fields
 def written_kind(
     kind: StructType, *other_keys: str, takes_distributions: bool = True
 ) -> StructType:
-    """Derives the type of a table as written by an author from its complete type.
+    """Derives the type of a table in a scenario file from the type of the complete table.
 
     Every key becomes optional. A scalar may stand for a vector with one entry per joint, axis
     or parameter.
 
     Args:
         kind: Type of the complete table, for example `Limits`.
-        other_keys: Additional keys that an author may write, with string values.
+        other_keys: Additional keys that the file may contain, with string values.
         takes_distributions: True if a random distribution may take the place of each number.
     """
     fields: list[tuple[str, Any, Any]] = [(key, str, UNSET) for key in other_keys]

@@ -108,7 +108,7 @@ class WrittenSite(Frozen, frozen=True, kw_only=True):
 
 
 class WrittenChange(Frozen, frozen=True, kw_only=True, omit_defaults=True):
-    """Planned change of a network link or of dominance factors, as written by an author.
+    """Planned change of a link or of dominance factors, in the form used in scenario files.
 
     The keys of `to` depend on what is changed (see `change.Change`).
     """

@@ -339,7 +339,7 @@ class _ExpectationRow(NamedTuple):
     mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the texts of this row in the printed table, one for each of `TRIAL_COLUMNS`.
+        """Returns the cells of this row of the printed table, one for each of `TRIAL_COLUMNS`.
 
         They include the limit, the worst measured value, and the number of runs that met the
         expectation.

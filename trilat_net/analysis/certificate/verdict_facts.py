@@ -129,7 +129,7 @@ class UnclosedBalance(NamedTuple):
 
 
 class WrongTorque(NamedTuple):
-    """Finding that recorded torques of an arm do not follow from its control law, Eq. (13).
+    """Finding that the recorded torques of an arm do not match its control law, Eq. (13).
 
     The log is then inconsistent, for example because it was modified or the arm ran a different
     law.

@@ -285,8 +285,9 @@ class TwinGrowth(NamedTuple):
     def needs_s(self) -> float | None:
         """Length of a run that would clearly show that small pushes decay, in s.
 
-        Within this length, the push that decays most slowly can halve four more times at its
-        present rate. `None` if the pushes do not decay, or if the run is already long enough.
+        In a run of this length, the difference that decays most slowly can halve four more
+        times at its present rate. `None` if the differences do not decay, or if the run is
+        already long enough.
         """
         worst = self.worst
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
@@ -815,16 +816,16 @@ class _LinearSizes(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class PushedTwins(Result):
-    """Result of `trilat twin`: how pushes at a given time of a recorded run develop.
+    """Result of `trilat twin`: how small disturbances (pushes) of a recorded run grow or decay.
 
-    A push may, for example, change the angle of one joint by a small amount, in a repetition of
-    the run that is called a twin. The result shows whether the difference from the run grows or
-    decays.
+    A push changes, for example, the angle of one joint at a given time in a repetition of the
+    run. The repetition is called a twin. The result shows whether the difference between the
+    twin and the run grows or decays.
 
     Attributes:
         log: The log of the run.
         at_s: Time of the pushes, in s.
-        growth: Growth of the pushes.
+        growth: Growth of the differences that the pushes cause.
         linear: Range of sizes for which the effect of a push is proportional to its size, or
             `None` if the user did not ask for several sizes.
     """

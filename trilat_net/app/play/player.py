@@ -149,10 +149,10 @@ class LatenessHistogram:
     """
 
     class Summary(NamedTuple):
-        """How late messages were published in a replay: median, 99th percentile and maximum.
+        """Lateness of the messages of a replay: median, 99th percentile and maximum, in us.
 
-        The times are in us. If a percentile is above `LATENESS_LIMIT_US`, the histogram does
-        not resolve it. Then it is replaced by the maximum.
+        A percentile above `LATENESS_LIMIT_US` is outside the range of the histogram, so the
+        maximum is stated instead.
         """
 
         p50_us: int

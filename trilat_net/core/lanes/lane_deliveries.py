@@ -102,10 +102,9 @@ class LinkStates(NamedTuple):
 
     @classmethod
     def copy_from(cls, tables: Sequence[SiteArrays]) -> "LinkStates":
-        """Copies the network link states of several runs into shared arrays.
+        """Copies the network link states of several runs into shared arrays, one run per lane.
 
-        The runs are simulated together, with one run per lane. This must happen before their
-        first tick.
+        The states must be copied before the first tick of the runs.
 
         Args:
             tables: Arrays of all sites for each run. They are not changed.

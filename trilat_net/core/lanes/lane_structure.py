@@ -53,9 +53,10 @@ class SiteStructure(NamedTuple):
 
 
 class RunStructure(NamedTuple):
-    """Properties of a run that select its equations. Runs with equal properties share code.
+    """Properties of a run that determine which code is compiled for it.
 
-    Runs that differ only in numerical values, such as gains or delays, have equal structures.
+    Runs that differ only in numerical values, such as gains or delays, have equal structures
+    and share their code.
 
     Attributes:
         sites: Structure of each site.

@@ -640,7 +640,7 @@ class CompiledRun:
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the first arm left its safety limits, in s. None if no arm did."""
+        """Time at which an arm first exceeded its safety limits, in s. None if no arm did."""
         ends_ns = [int(end_ns) for end_ns in self._progress["diverged_ns"] if end_ns >= 0]
         return min(ends_ns) / NS_PER_S if ends_ns else None
 

@@ -537,7 +537,8 @@ class VizChannels:
     def most_bytes(self) -> int:
         """Upper bound on the size of the messages that are still to be written, in bytes.
 
-        The messages of a bucket are written when the bucket ends.
+        Messages are collected over a fixed interval of time (a bucket), and are written at its
+        end.
         """
         return sum(buckets.max_pending_bytes for buckets in self._buckets)
 

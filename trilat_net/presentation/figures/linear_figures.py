@@ -370,9 +370,9 @@ _TRANSPORT_STEP = 0.22
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
     """Draws the measured one-way delays of a network, in ms, for several loads and transports.
 
-    A load (case) is a message size in bytes and a number of messages per second. The load
-    required by the benchmarked experiment is shaded. Transports are the network protocols that
-    were measured.
+    Each load combines a message size in bytes with a message rate per second. The load required
+    by the benchmarked experiment is shaded. Transports are the network protocols that were
+    measured.
 
     Args:
         facts: Results of the network benchmark, from `NetworkBenchmark.to_dict`.

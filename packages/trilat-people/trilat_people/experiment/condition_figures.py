@@ -222,13 +222,13 @@ def draw_learning(
     """Plots how a measure changes from trial to trial of a block, with one line per condition.
 
     Args:
-        rows: One row per trial, as for `statistics`, including the number `trial` of the trial
-            in its block.
+        rows: One row per trial, as for `statistics`, including `trial`, the position of the
+            trial in its block.
         measure: Name of the measure in the rows.
         unit: Unit over which trials are averaged first, "participant" or "pair".
-        limit_s: Time limit of a trial, in s, if some trials were not completed in time; medians
-            are then plotted, with open markers on the line of the limit for medians beyond it.
-            `None` if all trials were completed.
+        limit_s: Time limit of a trial, in s, or `None` if all trials were completed. With a
+            time limit, medians are plotted, and medians above the limit appear as open markers
+            on the limit line.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)

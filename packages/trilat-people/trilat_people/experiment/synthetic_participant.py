@@ -66,7 +66,7 @@ class ParticipantModel(Frozen, frozen=True):
     spread: Share = 0.15
 
     def draw(self, seed: int) -> "ParticipantModel":
-        """Draws an individual participant around these mean parameters.
+        """Draws the parameters of an individual participant around these mean parameters.
 
         Multiplies five parameters by log-normal factors with the deviation `spread`: the
         reaction time, both constants of Fitts' law, the noise and the crossover frequency.

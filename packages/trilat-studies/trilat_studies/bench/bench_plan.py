@@ -716,7 +716,8 @@ class BenchCell(NamedTuple):
     def key(self) -> str:
         """Name of this cell in the journal of finished runs.
 
-        It contains the hash `inputs`, so runs with other gains cannot be mistaken for these.
+        The name contains the hash `inputs`, so runs with different gains are not mistaken for
+        runs of this cell.
         """
         return f"{self.name} {self.inputs}"
 

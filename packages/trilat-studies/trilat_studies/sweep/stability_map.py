@@ -986,9 +986,9 @@ class MapLine(NamedTuple):
 
     @property
     def drawn_excess(self) -> Array:
-        """The quantity whose zero is the line, at the columns between which the line is drawn.
+        """Values, at each column, of the function whose zero crossing is the line.
 
-        These are the fine columns if the line was computed there, and the columns of the map
+        The columns are the fine ones if the line was computed there, and the columns of the map
         otherwise.
         """
         return self.fine_excess if self.fine_positions else self.excess

@@ -83,8 +83,9 @@ class Objective(StrEnum):
             score: Score of the candidate.
 
         Returns:
-            The objective and the effort, or `None` if the candidate cannot be on a Pareto front
-            because it is not stable or does not end at the common pose.
+            The objective and the effort. `None` if the candidate is excluded from the Pareto
+            front because it is unstable, or because it does not end at the pose that all
+            candidates must reach.
         """
         value = score.error_rad if self is Objective.ERROR else score.settled_s
         if score.outcome is not CandidateClass.SETTLED:
