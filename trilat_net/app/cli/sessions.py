@@ -48,9 +48,7 @@ class _SessionPage(Protocol):
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> AbstractContextManager[Callable[[], bool]]:
-        """Shows the session while it runs. See `SessionAttendant` for the arguments and the
-        result.
-        """
+        """Shows the session while it runs; see `SessionAttendant` for arguments and result."""
 
     def offer_results(self, paths: Iterable[Path]) -> None:
         """Adds links for downloading the report and the log to the session's web page.
