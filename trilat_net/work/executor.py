@@ -8,9 +8,9 @@ overhead, several items are sent to a worker at once, as a batch.
 Invariant:
     - The result of an item does not depend on the worker that runs it.
     - The number of items in flight is bounded.
-    - An item whose worker died is run again, up to `MAX_LOSSES` times in total. Its last
-      attempt runs alone, which ensures that the item named in the error message is the one that
-      kills its workers.
+    - An item whose worker died is retried, with at most `MAX_LOSSES` attempts in total. No
+      other item runs during its last attempt. Therefore the item named in the error message is
+      the one that kills its workers.
 """
 
 import itertools

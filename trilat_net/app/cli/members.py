@@ -345,8 +345,8 @@ def replay_command(
         exclude: Leave out these channels, for example '**/link'; repeatable.
         prefix: Name the replayed session WORD-NAME, where NAME is the recorded name; '' keeps
             the recorded name.
-        time: Timestamps that set the timing: when messages were sent (publish), or when they
-            arrived (log).
+        time: Timestamps that determine when messages are played: those at which they were sent
+            (publish), or at which they arrived (log).
         low_cpu: Sleep until each deadline to save processor time; the timing is then about 0.1
             ms less exact.
         preload: Largest log that is held in memory, MiB; a separate process reads larger logs
