@@ -283,7 +283,7 @@ def twin_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Repeats a run with a small push, to see whether the push dies away.
+    """Repeats a run with a small push: does the push die away?
 
     A repetition with a push is called a twin. Each twin uses the message arrivals, delays, hand
     motions and setting changes recorded in the run. The difference from the original run is

@@ -457,7 +457,7 @@ def reset_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Clears the faults of sites, provided that the causes have been removed.
+    """Clears the faults of sites whose causes have been removed.
 
     The sites then wait for the other sites. Each arm aligns with the other arms before
     following them.
