@@ -1,7 +1,7 @@
-"""The parts that users start: the command line, the Python interface, a demo, and checks.
+"""The user-facing parts: the command line, the Python interface, a demo, and checks.
 
-`cli` contains the `trilat` command, and `api` the functions of the package trilat_net. Each
-parses its arguments and calls the packages that do the work.
+`cli` contains the `trilat` command, and `api` the Python functions of the package trilat_net.
+Both only parse their arguments and call the packages that do the work.
 """
 
 from typing import TYPE_CHECKING

@@ -1,13 +1,13 @@
-"""The Python functions of the commands that need no network.
+"""Python functions for the commands that need no network.
 
-For example, `trilat_net.simulate("paper")` does what `trilat sim paper` does, and returns the
-log of the run. Each function accepts a scenario (the description of an experiment) in any form:
-the name of a shipped scenario, the path of a TOML file, a TOML text, its tables, or a
-`Scenario`. A log is the path of an MCAP file, or a `Log`. Functions that need a network are in
-other modules.
+For example, `trilat_net.simulate("paper")` runs the same simulation as `trilat sim paper` and
+returns its log. Wherever a function takes a scenario (the description of an experiment), it
+accepts the name of a shipped scenario, the path of a TOML file, a TOML string, a mapping of its
+tables, or a `Scenario`. A log can be given as a `Log` or as the path of an MCAP file. The
+functions that need a network are in other modules.
 
 Invariant:
-    - These functions only convert their arguments, and call the packages that do the work.
+    - These functions only convert their arguments and call the packages that do the work.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,28 +43,28 @@ def simulate(
     duration_s: float | None = None,
     seed: int | None = None,
 ) -> SimulatedLog:
-    """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
+    """Simulates a scenario in virtual time and returns the log; the command is `trilat sim`.
 
-    In virtual time, one process computes all arms and the network, as fast as possible. The
-    function warns if the run diverged. The time of divergence is then in `log.diverged_s`.
+    In virtual time, a single process simulates all arms and the network as fast as possible. A
+    run that diverges triggers a warning, and `log.diverged_s` holds the time of divergence.
 
     >>> log = tn.simulate("two_sites", duration_s=0.1)
     >>> log["m"].q.shape
     (100, 2)
 
     Args:
-        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
-            a path, a TOML text, its tables, or a `Scenario`.
-        set: Settings that replace those of the scenario ("overrides"), as in
-            `{"control.Kd": 5}` or `["control.Kd=5"]`.
+        scenario: Name of a shipped scenario, path of a TOML file, TOML string, mapping of its
+            tables, or `Scenario`.
+        set: Overrides of scenario settings, for example `{"control.Kd": 5}` or
+            `["control.Kd=5"]`.
         duration_s: Duration of the run, in s. Default: the scenario's duration.
-        seed: Seed of the random delays and losses of messages. Default: the scenario's seed.
+        seed: Random seed for message delays and losses. Default: the scenario's seed.
 
     Returns:
-        The log, which contains one record per control period and site.
+        The log, with one record per site and control period.
 
     Raises:
-        ScenarioError: The scenario or an override is not valid.
+        ScenarioError: The scenario or an override is invalid.
     """
     resolved = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
     log = SimulatedLog(resolved)
@@ -80,7 +80,7 @@ def export(
     force: bool = False,
     **settings: Any,
 ) -> Path:
-    """Exports a log to files that other tools can read, and returns their path.
+    """Exports a log to a format that other tools can read, and returns the output path.
 
     The command is `trilat log export`.
 
@@ -88,17 +88,17 @@ def export(
     'run.npz'
 
     Args:
-        log: The log, or its path. The format lerobot also accepts several logs, or a folder of
-            logs.
+        log: The log, or its path. The lerobot format also accepts a list of logs, or a folder
+            of logs.
         to: Format: ros2, parquet, csv, npz, mat or lerobot.
-        out: Path of the file, or of the folder for parquet, csv and lerobot.
+        out: Path of the output file, or of the output folder for parquet, csv and lerobot.
         force: True to replace an existing file or folder.
-        settings: Settings of the format, such as `fps=30`, `observations="plugin"` and
+        settings: Format-specific settings, such as `fps=30`, `observations="plugin"` and
             `task="grasp"` for lerobot (docs/studies/lerobot.md).
 
     Raises:
-        UsageError: There is no such format or setting, a package is missing, or the path
-            exists.
+        UsageError: The format or a setting is unknown, a required package is missing, or the
+            output path already exists.
     """
     from ..presentation import Exporter
 
@@ -117,7 +117,7 @@ def verify(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> LogCheckReport:
-    """Executes a run again from its log, and compares all computed numbers bit for bit.
+    """Recomputes a run from its log and checks that every computed number matches bit for bit.
 
     The command is `trilat verify`.
 
@@ -126,17 +126,17 @@ def verify(
 
     Args:
         log: The log, or its path.
-        virtual: True to compare the log also with a run in virtual time, in which one process
-            computes all arms and the network.
-        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
+        virtual: True to also compare the log with a run in virtual time, in which a single
+            process simulates all arms and the network.
+        min_coverage: Minimum fraction of each site's ticks (control periods) that must be
             compared for the check to pass.
-        resume_every: Number of ticks after which the state of each site is restored from the
-            log, again and again. This reveals state of a user's control law that the log lacks.
-            If 0, the state is never restored.
+        resume_every: Restore the state of each site from the log every this many ticks. This
+            reveals any state of a user-written control law that is missing from the log. If 0,
+            the state is never restored.
 
     Returns:
-        The result of the comparison. Its property `passed` is True if all numbers are equal, if
-        enough ticks were compared, and if the log is unchanged since it was written.
+        The result of the comparison. Its property `passed` is True if all numbers match, enough
+        ticks were compared, and the log has not been modified since it was written.
 
     Raises:
         LogError: The log cannot be read.
@@ -153,27 +153,28 @@ def certify(
     own_laws: bool = False,
     twins: int | None = None,
 ) -> Certificate:
-    """Judges whether a recorded run is stable; the command is `trilat certify`.
+    """Decides whether a recorded run was stable; the command is `trilat certify`.
 
-    The judgement is "stable", "not stable", or "open" if neither can be shown.
+    The verdict is "stable", "settled", "not stable" or "open" (none of the others could be
+    shown).
 
     >>> print(tn.certify(tn.simulate("free")).stability)
     stable
 
     Args:
         log: The log, or its path.
-        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
-            judged before the run can be called stable.
-        own_laws: True if the code of a user's control laws may be executed. The code is needed
+        min_coverage: Minimum fraction of each site's ticks (control periods) that must be
+            assessed before the run can be called stable.
+        own_laws: True to allow user-written control laws to be executed. Their code is needed
             to check the energies that a law reports, and to repeat the run.
-        twins: Number of repetitions of the run with a small disturbance ("twins"). They show
+        twins: Number of times to repeat the run with a small disturbance ("twins"), which shows
             whether disturbances grow.
 
     Returns:
-        The judgement with its reasons.
+        The verdict and the reasons for it.
 
     Raises:
-        LogError: The log cannot be read, or no site has a record in it.
+        LogError: The log cannot be read, or contains no records of any site.
     """
     from ..analysis import certify_run
 
@@ -206,12 +207,13 @@ def metrics(log: AnyLog) -> LogMetrics:
 
 
 def choose_report_folder(log: Path) -> Path:
-    """Returns the folder in which the report of a log is stored, next to the log.
+    """Returns the default folder for the report of a log, located next to the log.
 
-    For example, the report of "run.mcap" is in the folder "run".
+    For example, the report of "run.mcap" goes into the folder "run".
 
     Args:
-        log: File of the log. If its name has no suffix, the folder's name ends in "-report".
+        log: Path of the log. If it has no suffix, "-report" is appended to form the folder
+            name.
     """
     return log.with_suffix("") if log.suffix else log.with_name(f"{log.name}-report")
 
@@ -227,17 +229,16 @@ def report(
 
     Args:
         log: Path of the log, or a log that was opened from a file.
-        out: Folder of the report. By default the name of the file without .mcap.
-        force: True to use a folder that is not empty.
-        png: True to write every figure as a PNG file too.
+        out: Folder for the report. Default: the path of the log without .mcap.
+        force: True to allow a folder that is not empty.
+        png: True to also save every figure as a PNG file.
 
     Returns:
-        The conclusion of the report: the checks of the log, the judgement whether the run was
-        stable, and the paths of the files.
+        The result of the log checks, the stability verdict, and the paths of the files written.
 
     Raises:
         UsageError: The folder is not empty, or the log is not in a file.
-        LogError: The log cannot be read, or no site has a record in it.
+        LogError: The log cannot be read, or contains no records of any site.
     """
     from ..presentation import conclude
 
@@ -263,33 +264,33 @@ def linear(
     ports: bool = True,
     operators: Sequence[str | Path] = (),
 ) -> "LinearAnalysis":
-    """Linearises the closed loop of all arms about its equilibrium, and analyses it.
+    """Linearises the closed loop of all arms about its equilibrium and analyses its stability.
 
-    The analysis contains the characteristic roots, the margins to instability, the passivity,
-    and the impedances that operators feel. The command is `trilat linear`.
+    The analysis covers the characteristic roots, the stability margins, passivity, and the
+    impedances that operators feel. The command is `trilat linear`.
 
     >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
     'unstable'
 
     Args:
-        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
-            a path, a TOML text, its tables, or a `Scenario`. For a log, the loop is analysed as
-            it was at the end of the run, after all commands.
-        set: Settings that replace those of the scenario, as in `{"control.d": 0.9}`.
+        scenario: Name of a shipped scenario, path of a TOML file, TOML string, mapping of its
+            tables, or `Scenario`. Given a log, analyses the loop as it was at the end of the
+            run, after all commands.
+        set: Overrides of scenario settings, for example `{"control.d": 0.9}`.
         pose: Joint angles of all sites, in rad. Default: the angles at the end of a run.
-        roots: Number of characteristic roots to compute. The roots are the exponents of the
-            loop's motions.
-        over: Ranges of settings in which to search for edges of stability (values at which the
-            stability changes), as in `["control.d=0.1:3"]`.
+        roots: Number of characteristic roots to compute (the complex exponents of the loop's
+            modes).
+        over: Ranges of settings to search for stability boundaries (values at which the
+            stability changes), for example `["control.d=0.1:3"]`.
         ports: True to analyse passivity and the impedances that operators feel.
-        operators: Files of measured operators, from `trilat identify hand --json`.
+        operators: Paths of measured operator models, written by `trilat identify hand --json`.
 
     Returns:
-        The analysis, with its verdict.
+        The analysis, including its verdict.
 
     Raises:
-        ScenarioError: The scenario is not valid, or has no linear loop.
-        UsageError: Another argument is not valid.
+        ScenarioError: The scenario is invalid, or has no linear loop.
+        UsageError: Another argument is invalid.
     """
     from ..analysis import analyse_linear_loop
 
@@ -321,26 +322,26 @@ def view(
     rviz: bool = False,
     viewer: str | None = None,
 ) -> None:
-    """Opens a log in the viewer Rerun; the command is `trilat log view`.
+    """Opens a log in the Rerun viewer; the command is `trilat log view`.
 
-    The function returns when the viewer is closed.
+    Blocks until the viewer is closed.
 
     >>> tn.view("run.mcap")  # doctest: +SKIP
 
     Args:
-        files: Path of the log, or paths of its parts.
-        full: True to show the record of every control period, False to show fewer, evenly
-            spaced records.
+        files: Path of the log, or the paths of its parts.
+        full: True to show the record of every control period, False to show an evenly spaced
+            subset.
         save: Path of a Rerun file to write instead of opening the viewer.
-        foxglove: True to write a layout for the viewers Foxglove and Lichtblick beside the log,
-            as run.foxglove.json, instead of opening Rerun.
-        rviz: True to write a configuration of RViz for the ROS 2 topics of the session beside
-            the log, as run.rviz, instead of opening Rerun.
-        viewer: Name of a viewer, added by another package, that opens the log instead of Rerun.
+        foxglove: True to write a layout for Foxglove and Lichtblick next to the log
+            (run.foxglove.json) instead of opening Rerun.
+        rviz: True to write an RViz configuration for the session's ROS 2 topics next to the log
+            (run.rviz) instead of opening Rerun.
+        viewer: Name of a viewer, provided by another package, to open instead of Rerun.
 
     Raises:
-        UsageError: Rerun is not installed, there is no display, a file exists, or there is no
-            such viewer.
+        UsageError: Rerun is not installed, there is no display, an output file already exists,
+            or the viewer is unknown.
         LogError: The log cannot be read.
     """
     from ..log.ros2 import write_rviz_config

@@ -1,20 +1,20 @@
-"""Runs a whole session on one machine, with a process per site and a recorder.
+"""Runs a complete session on one machine, with one process per site and a recorder.
 
 A session is a run in which several robot arms are coupled over a network. A site is a process
 that runs one arm and its control loop. The recorder is a process that writes the log of the
 session. `run_demo` runs such a session for the command `trilat demo`, and `run` does so for
 Python programs.
 
-All processes are copies (forks) of one process, the starter, which has imported all modules and
-compiled the control code. A copy starts in a tenth of the time that a Python interpreter takes.
-The starter has no network connection, no threads of its own and no code of the user, because
-these cannot be copied safely.
+All processes are forked from one process, the starter, which has imported all modules and
+compiled the control code. Forking takes a tenth of the time needed to start a Python
+interpreter. The starter has no network connection, no threads of its own and no user code,
+because these cannot be forked safely.
 
 Invariant:
-    - The recorder always ends last, so that it receives the last messages of the sites.
+    - The recorder always ends last, to receive the final messages of the sites.
     - No child process is left when a function returns, even if this process is killed. If the
       starter is killed, all processes receive a signal to end.
-    - Each child has a process session of its own. Ctrl-C in the terminal therefore reaches only
+    - Each child runs in its own process session. Ctrl-C in the terminal therefore reaches only
       this process, which then ends the children in the right order.
 """
 
@@ -76,10 +76,10 @@ class SessionResult:
 
     Attributes:
         log: Path of the log. The file exists only if the session has begun.
-        problems: One sentence about each failure, in the order of the failures.
-        interrupted: Number of the signal that ended the session. 0 if no signal did.
-        exit_code: Exit code for the command. It states whether the run failed, or whether the
-            log could not be written to the disk.
+        problems: One sentence per failure, in order of occurrence.
+        interrupted: Number of the signal that ended the session, or 0 if none did.
+        exit_code: Exit code for the command. It indicates whether the run failed or the log
+            could not be written to the disk.
     """
 
     log: Path
@@ -91,13 +91,12 @@ class SessionResult:
 class SessionProcess:
     """State of one process of a session: a site, the recorder or an operator program.
 
-    `ProcessStarter` creates this object, and updates it with the reports of the starter
-    process.
+    Created by `ProcessStarter`, which updates it from the reports of the starter process.
 
     Attributes:
         name: Name of the process: the name of its site, or "recorder".
-        output: File with everything that the process prints.
-        pid: Process number. `None` before the process has started.
+        output: File that captures everything the process prints.
+        pid: Process ID. `None` before the process has started.
         code: Exit code. `None` before the process has ended.
     """
 
@@ -110,12 +109,12 @@ class SessionProcess:
         self._signalled = False
 
     def end(self, number: int) -> None:
-        """Ends the process by sending it a signal, such as SIGTERM.
+        """Sends the process a signal, such as SIGTERM, to end it.
 
-        The call has no effect if the process has ended already.
+        Does nothing if the process has already ended.
 
         Args:
-            number: Number of the signal in the operating system.
+            number: Signal number.
         """
         if self.code is None:
             self._signalled = True
@@ -126,8 +125,8 @@ class SessionProcess:
 
         Returns:
             A sentence with the exit code or signal, and the last line that the process printed.
-            `None` if the process has not failed: it is running, it ended with code 0, or it was
-            ended by a signal of this process.
+                `None` if the process has not failed: it is still running, it exited with code
+                0, or this process ended it with a signal.
         """
         exit_code = self.code
         if self._signalled and self.pid is None:
@@ -151,10 +150,10 @@ class SessionProcess:
 
 
 def create_file(path: Path) -> BinaryIO:
-    """Creates the file to which a process of a session writes its output.
+    """Creates the file that captures the output of a process of a session.
 
-    The user finds the errors of the process in this file. The file is not buffered, so that
-    nothing is lost in a crash. An earlier file of that name is deleted.
+    Users look for errors of the process in this file. It is unbuffered, so that nothing is lost
+    in a crash. An existing file of that name is deleted.
 
     Args:
         path: Path of the file.
@@ -171,12 +170,11 @@ def create_file(path: Path) -> BinaryIO:
 class ProcessStarter:
     """Starts the child processes of a session, and collects their output in a folder.
 
-    This object runs the starter as a child process (`run_starter`), and sends it requests
-    through a pipe. The starter reports through the same pipe when a process has started or
-    ended.
+    Runs the starter as a child process (`run_starter`) and sends it requests through a pipe.
+    Through the same pipe, the starter reports when a process has started or ended.
 
     Args:
-        scenario_file: Scenario of the session.
+        scenario_file: Path of the session's scenario file.
         folder: Folder for the output of each process.
     """
 
@@ -198,10 +196,9 @@ class ProcessStarter:
             )
 
     def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
-        """Requests the start of a command of `trilat` as a child process.
+        """Asks the starter to run a `trilat` command as a child process.
 
-        The starter is a process that has already imported all modules, so its copies start
-        quickly.
+        The starter has already imported all modules, so processes forked from it start quickly.
 
         Args:
             name: Name of the process, unique in the session.
@@ -220,11 +217,11 @@ class ProcessStarter:
     def signal(self, process: SessionProcess, number: int) -> None:
         """Sends a signal to a process of the session, for example to end it.
 
-        If the process has not been started yet, it will not be started at all.
+        A process that has not started yet is then never started.
 
         Args:
-            process: The process, as `start` returned it.
-            number: Number of the signal in the operating system.
+            process: Process returned by `start`.
+            number: Signal number.
         """
         self._send_order(process.name, [], number, process.output)
         # This signal interrupts a starter that is still importing modules. A starter that is
@@ -252,11 +249,11 @@ class ProcessStarter:
             self._pipe.send((name, arguments, number, output))
 
     def poll(self) -> None:
-        """Receives from the starter process which processes have started or ended.
+        """Receives reports from the starter about which processes have started or ended.
 
-        Each process object is updated with its process number or its exit code. If the starter
-        itself has failed, its processes are signalled to end. They then count as ended with the
-        exit code of the starter.
+        Updates the process ID or exit code of each process object. If the starter itself has
+        failed, its processes are signalled to end and treated as ended with the starter's exit
+        code.
         """
         try:
             while self._pipe.poll():
@@ -276,10 +273,10 @@ class ProcessStarter:
                         os.kill(process.pid, signal.SIGINT)
 
     def close(self) -> None:
-        """Ends the starter, the child process that starts all other processes of the session.
+        """Ends the starter process.
 
-        The method must be called after all other processes have ended, because without the
-        starter they cannot be signalled.
+        Call this method only after all other processes have ended, because they cannot be
+        signalled without the starter.
         """
         self._pipe.close()
         self._starter.send_signal(signal.SIGINT)
@@ -304,18 +301,16 @@ def run_demo(
     attend: SessionAttendant | None = None,
     begins: Callable[[], bool] | None = None,
 ) -> SessionResult:
-    """Runs a session on this machine, with a process for each site and for the recorder.
+    """Runs a session on this machine, with one process per site and one for the recorder.
 
-    The session has the name of the scenario.
-
-    A site is a process that runs one arm and its control loop. The recorder writes the log.
+    The session has the same name as the scenario.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
+        scenario: The scenario to run.
         folder: Folder for the log and for the output of the processes.
         console: Terminal of the user.
-        attend: Function that watches the session, for example to serve a web page, and may end
-            the session. `None` if the session is not watched.
+        attend: Function that attends to the session, for example by serving a web page, and may
+            end it. `None` if there is none.
         begins: Function that returns True once the session may begin. Until then, for at most
             `WAIT_S`, the sites wait for the recorder. The session begins a second or two later.
             If `None`, the session begins at once.
@@ -324,8 +319,8 @@ def run_demo(
         The outcome of the session. If the session has begun, the log is valid.
 
     Raises:
-        ScenarioError: The scenario lacks the limits of an external arm.
-        UsageError: The scenario has an operator that runs as a program of its own, and the
+        ScenarioError: The scenario does not specify the limits of an external arm.
+        UsageError: The scenario has an operator that runs as a separate program, and the
             package trilat-people is missing.
     """
     check_outside_arms(scenario)
@@ -397,14 +392,14 @@ def run_demo(
 
 
 def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Interrupt) -> None:
-    """Compiles the code of the control loop for a scenario, unless it is cached on disk.
+    """Compiles the control loop for a scenario, unless the compiled code is cached on disk.
 
-    The code depends on the number of joints of the arms. The compilation may take minutes, and
-    a signal such as Ctrl-C interrupts it.
+    The code depends on the number of joints of the arms. Compilation may take minutes, and can
+    be interrupted by a signal such as Ctrl-C.
 
     Args:
-        scenario: The scenario, which describes the arms, their links and the run.
-        say: Function that tells the user that the code is being compiled.
+        scenario: The scenario.
+        say: Function that prints a line for the user, called before a compilation starts.
         interrupt: Handler of the signals.
     """
     # The code depends only on the numbers of joints and links, so one site of each kind of arm
@@ -553,10 +548,10 @@ def _end_all(
     sites_ended_ns = clock.monotonic_ns()
 
     def must_end_now() -> bool:
-        """Returns True if the recorder must end at once, by a second signal.
+        """Returns True if the recorder must be ended at once, with a second signal.
 
-        This is the case if the user has pressed Ctrl-C a second time, or if the recorder has
-        not ended within `RECORDER_NS` after the sites.
+        This is the case if the user has pressed Ctrl-C a second time, or if the recorder is
+        still running `RECORDER_NS` after the sites ended.
         """
         return interrupt.is_repeated() or clock.monotonic_ns() - sites_ended_ns > RECORDER_NS
 
@@ -613,18 +608,18 @@ def _end_group(
 
 
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
-    """Runs the starter process, which creates the processes of a session as copies of itself.
+    """Runs the starter process, from which the processes of a session are forked.
 
-    A copy starts quickly, because all modules are imported and all code is compiled. As with
-    `os.fork`, the function returns in every process: in each copy, which then runs its command,
-    and finally in the starter, after the requesting process has disappeared.
+    Forked processes start quickly, because all modules are imported and all code is compiled.
+    As with `os.fork`, the function returns in every process: in each fork, which then runs its
+    command, and finally in the starter, after the requesting process has disappeared.
 
     Args:
         number: File descriptor of the pipe to the requesting process.
-        scenario_file: Scenario of the session.
+        scenario_file: Path of the session's scenario file.
 
     Returns:
-        In a copy, the command and arguments that the copy has to run. In the starter, `None`.
+        In a fork, the command and arguments that the fork must run. In the starter, `None`.
     """
     # Until all modules are imported, the signal simply ends this process.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -657,19 +652,19 @@ class _StarterProcess:
         self._running: dict[str, int] = {}
 
     def serve(self) -> list[str] | None:
-        """Executes requests to start processes or to signal them, and reports when they end.
+        """Handles requests to start processes or to signal them, and reports when they end.
 
-        Each new process is a copy of this starter process, made by `os.fork`. Therefore the
-        method returns in every copy and, at the end, in the starter.
+        Each new process is forked from this starter process with `os.fork`. Therefore the
+        method returns in every fork and, at the end, in the starter.
 
         A request is a tuple of four values: the name of the process; the command and its
         arguments; the number of the signal to send, or 0 to start the process; and the file for
         the output of the process.
 
         Returns:
-            The command and its arguments, if the method returns in a copy, which must now
-            execute the command. `None`, if it returns in the starter, after the requesting
-            process has disappeared and all copies have ended.
+            In a fork, the command and its arguments, which the fork must now execute. In the
+            starter, `None`, after the requesting process has disappeared and all forks have
+            ended.
         """
         arguments: list[str]
         longest_wait_s = POLL_NS / 10 / NS_PER_S  # then the ends of processes are reported
@@ -772,25 +767,24 @@ def run(
 ) -> Log:
     """Runs a scenario live, with one process per site and a recorder, and returns the log.
 
-    The command `trilat demo` does the same, and also reports on the log, as `tn.report(log)`
-    does.
+    The command `trilat demo` does the same, and also writes a report, as `tn.report(log)` does.
 
     >>> log = tn.run("two_sites", duration_s=2)
     >>> tn.verify(log).passed
     True
 
     Args:
-        scenario: The name of a shipped scenario, a path, a TOML text, the tables of a scenario,
-            or a scenario.
-        set: Settings that replace those of the scenario, as in `{"control.Kd": 5}`.
-        duration_s: Duration of the run in s. If `None`, the scenario's duration is kept.
-        seed: Seed of the random numbers. If `None`, the scenario's seed is kept.
-        out: Folder of the log. If `None`, the next free folder runs/NAME-N is used.
-        force: True if the folder may contain files already.
-        quiet: True if nothing is printed during the run.
+        scenario: Name of a shipped scenario, path of a TOML file, TOML string, mapping of its
+            tables, or `Scenario`.
+        set: Overrides of scenario settings, for example `{"control.Kd": 5}`.
+        duration_s: Duration of the run, in s. If `None`, the scenario's duration is kept.
+        seed: Random seed. If `None`, the scenario's seed is kept.
+        out: Folder for the log. If `None`, the next free folder runs/NAME-N is used.
+        force: True to allow a folder that already contains files.
+        quiet: True to print nothing during the run.
 
     Raises:
-        ScenarioError: The scenario or a replaced setting is not valid.
+        ScenarioError: The scenario or an override is invalid.
         RunFailed: A process failed, or the run was interrupted. The message says whether there
             is a log.
     """

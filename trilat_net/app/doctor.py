@@ -1,13 +1,13 @@
-"""Checks whether this machine is ready for a session, and states how to solve each problem.
+"""Checks whether this machine is ready for a session, and suggests a fix for each problem.
 
-A session consists of processes ("sites") that run arms at 1000 ticks per second and exchange
-their states over the network. The checks concern the keys, the network endpoints, the clocks,
-the operating system's real-time rights, the tick rate that this machine achieves, the disk and
+A session consists of processes (sites) that run arms at 1000 ticks per second and exchange
+their states over the network. The checks cover the keys, the network endpoints, the clocks, the
+operating system's real-time privileges, the tick rate that this machine achieves, the disk and
 the processors. The command is `trilat doctor`.
 
-Each check yields a finding: its result and, if there is a problem, a remedy. The checks change
-nothing on this machine. The real-time rights and the tick rate are measured in another process,
-because the settings of the measuring process have to be changed for that.
+Each check yields a finding, which states the result and, if there is a problem, a remedy. The
+checks do not modify this machine. The real-time privileges and the tick rate are measured in a
+separate process, because the measuring process must change its own settings.
 """
 
 import json
@@ -79,12 +79,12 @@ MIN_PUNCTUAL_SHARE = 0.99
 class DoctorFinding(NamedTuple):
     """Result of one check of this machine, for example of the free disk space.
 
-    `trilat doctor` prints it as one line.
+    `trilat doctor` prints each finding on its own line.
 
     Attributes:
         check: Subject of the check, such as "keys" or "disk".
-        state: "ok", "warn" for a possible problem, or "fail" for a certain problem.
-        text: Sentence about the result and, if there is a problem, its remedy.
+        state: "ok", "warn" for a possible problem, or "fail" for a definite problem.
+        text: Description of the result and, if there is a problem, its remedy.
     """
 
     check: str
@@ -270,16 +270,16 @@ _RIGHTS_CODE = (
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
-    """Measures how punctual the control loop is on this machine, at decreasing rates.
+    """Measures how punctual the control loop is on this machine, at decreasing rates in Hz.
 
-    The measurement ends at the first rate that the machine achieves, for example 1 kHz.
+    Stops at the first rate that the machine achieves, for example 1 kHz.
 
     Args:
         clock: Clock of this process.
 
     Returns:
-        For each rate that was tried: the rate in Hz, the lateness in us that
-            `MIN_PUNCTUAL_SHARE` of its ticks did not exceed, and the largest lateness in us.
+        For each rate tried: the rate in Hz, the lateness in us that a fraction
+            `MIN_PUNCTUAL_SHARE` of the ticks did not exceed, and the maximum lateness in us.
     """
     results: list[tuple[int, int, int]] = []
     for rate_hz in RATES_HZ:
@@ -318,16 +318,16 @@ _RATES_CODE = (
 
 
 class MachineExamination:
-    """Examination whether this machine can run a session, with a method for each subject.
+    """Examines whether this machine can run a session, with one method per subject.
 
     Args:
-        connection: Endpoints at which this machine would listen, or to which it would connect.
+        connection: Endpoints that this machine would listen on or connect to.
         keys: Folder of a member's keys. `None` if there are no keys.
-        folder: Folder where results would be stored.
-        session: Name of a running session with whose members the clocks are compared. `None` if
-            the comparison is not made.
+        folder: Folder in which results would be stored.
+        session: Name of a running session; this machine's clock is compared with the clocks of
+            its members. `None` to skip this comparison.
         clock: Clock of this process.
-        insecure: True to permit connections without keys, because everybody on the network is
+        insecure: True to allow connections without keys, because everybody on the network is
             trusted.
     """
 
@@ -356,9 +356,9 @@ class MachineExamination:
                 self._keys_error = str(error)
 
     def run(self) -> Iterator[DoctorFinding]:
-        """Performs all checks, and yields each result at once.
+        """Performs all checks, and yields each finding as soon as it is known.
 
-        Some checks take seconds. The user sees each result as soon as it is known.
+        Some checks take seconds.
 
         Yields:
             The findings, in the order of the checks.
@@ -374,9 +374,9 @@ class MachineExamination:
         yield from self.check_room()
 
     def check_keys(self) -> Iterator[DoctorFinding]:
-        """Checks whether a member's keys are valid, for how long, and who can read them.
+        """Checks whether a member's keys are valid, when they expire, and who can read them.
 
-        Keys encrypt the connections of a session, and prove which process has sent a message.
+        Keys encrypt the connections of a session and prove which process sent a message.
 
         Yields:
             The findings about the keys.
@@ -429,8 +429,8 @@ class MachineExamination:
         An endpoint is an address with a protocol, such as "tls/[::1]:7447".
 
         Yields:
-            The findings about the endpoints. There is a single finding if no endpoint can be
-            used at all.
+            The findings about the endpoints, or a single finding if no endpoint can be used at
+            all.
         """
         try:
             secured = self._secure_connection()
@@ -465,9 +465,9 @@ class MachineExamination:
     def check_clock(self) -> Iterator[DoctorFinding]:
         """Checks for `CLOCK_TEST_NS` whether the clocks of this machine run steadily.
 
-        The monotonic clock must not go back. The time of day must not step relative to the
-        monotonic clock. The finding also states the longest time between two readings, which
-        shows how long the operating system interrupts a process.
+        The monotonic clock must not go backwards, and the time of day must not jump relative to
+        it. The finding also states the longest gap between two readings, which shows for how
+        long the operating system interrupts a process.
 
         Yields:
             One finding about the clocks.
@@ -545,7 +545,7 @@ class MachineExamination:
         """Reports which parts of the program work on this operating system.
 
         Returns:
-            A single finding. It is "ok" on Linux. On other systems, it names the missing parts.
+            A single finding: "ok" on Linux; on other systems, it names the missing parts.
         """
         name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
         if name == "Linux":
@@ -562,8 +562,8 @@ class MachineExamination:
     def check_rights() -> Iterator[DoctorFinding]:
         """Checks which real-time settings the operating system grants to a site.
 
-        For example, a site needs a high priority, so that its control loop is not interrupted
-        by other programs.
+        For example, a site needs a high priority to keep other programs from interrupting its
+        control loop.
 
         Yields:
             One finding per setting, or a single warning if the settings could not be tried.
@@ -592,10 +592,10 @@ class MachineExamination:
 
     @staticmethod
     def check_rate() -> DoctorFinding:
-        """Measures the highest rate at which a control loop is punctual on this machine.
+        """Measures the highest rate, in Hz, at which a control loop is punctual here.
 
-        Each rate of `RATES_HZ`, such as 1000 Hz, is tried for `REHEARSAL_S`. The trials end
-        with the first rate at which the loop begins its periods on time.
+        Each rate in `RATES_HZ`, such as 1000 Hz, is tried for `REHEARSAL_S`, until the loop
+        starts its periods on time.
         """
         if not is_core_cached():
             return DoctorFinding(
@@ -637,12 +637,10 @@ class MachineExamination:
         return DoctorFinding("rate", "warn" if missed_rates else "ok", text)
 
     def check_room(self) -> Iterator[DoctorFinding]:
-        """Checks whether disk space, processors and compiled code suffice for a session.
+        """Checks disk space, processors, and whether the control loop is already compiled.
 
-        If the control code has not been compiled and cached yet, the first run takes longer to
-        start.
-
-        The folder for results need not exist.
+        If the control loop has not been compiled and cached yet, the first run takes longer to
+        start. The results folder does not have to exist.
         """
         # The folder may be created later. Its nearest existing parent has the same disk.
         folder = self._folder.absolute()
@@ -691,13 +689,13 @@ class DoctorReport(Result):
     """Result of `trilat doctor`: whether this machine is ready for a live session.
 
     Attributes:
-        findings: Result of each check, in the order of the checks.
+        findings: Findings in the order of the checks.
     """
 
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns the number of checks with each result, for example "0 fail, 2 warn, 9 ok"."""
+        """Returns the number of findings in each state, for example "0 fail, 2 warn, 9 ok"."""
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
@@ -706,22 +704,22 @@ class DoctorReport(Result):
     def to_dict(self) -> dict[str, Any]:
         """Converts all findings to plain values, with the keys of `trilat doctor --json`.
 
-        The only key is "findings". Its value has the rows of `to_rows`.
+        The only key, "findings", contains the rows returned by `to_rows`.
         """
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Converts the results to a table with a row per check, for example for pandas.
+        """Converts the findings to a table with one row per check, for example for pandas.
 
-        The fields of `DoctorFinding` are the columns.
+        The columns are the fields of `DoctorFinding`.
         """
         return [finding._asdict() for finding in self.findings]
 
     def blocks(self) -> Iterator[Any]:
-        """Returns the lines that `trilat doctor` prints, one per finding with its mark.
+        """Returns the lines that `trilat doctor` prints, one per finding, marked by state.
 
-        The module that composes the lines is imported inside this method, because a program
-        that only reads the findings does not need it.
+        The formatting module is imported inside this method, because a program that only reads
+        the findings does not need it.
         """
         from ..presentation import compose_doctor
 
@@ -744,17 +742,18 @@ def doctor(
     True
 
     Args:
-        listen: Endpoints at which this machine would listen.
-        connect: Endpoints to which this machine would connect.
+        listen: Endpoints that this machine would listen on.
+        connect: Endpoints that this machine would connect to.
         router: Endpoints of routers that this machine would connect to.
         keys: Folder of a member's keys. `None` if there are no keys.
-        session: Name of a running session with whose members the clocks are compared.
-        folder: Folder where results would be stored.
-        insecure: True to permit connections without keys, because everybody on the network is
+        session: Name of a running session; this machine's clock is compared with the clocks of
+            its members.
+        folder: Folder in which results would be stored.
+        insecure: True to allow connections without keys, because everybody on the network is
             trusted.
 
     Returns:
-        The findings.
+        A report with the finding of each check.
 
     Raises:
         UsageError: An endpoint or the keys cannot be used.

@@ -1,12 +1,12 @@
-"""Defines the interface of input devices, which move an arm and let a person feel its force.
+"""Interface for input devices that move an arm and let a person feel the arm's force.
 
-To support another device, a program defines a class with the methods of `Device`, and passes an
-object of the class to `RunningSession.lead`.
+To support another device, write a class with the methods of `Device`, and pass an instance to
+`RunningSession.lead`.
 
 Invariant:
     - All devices use the coordinates of the person who holds them: x to the right, y ahead and
       z up. The units are m, m/s and N.
-    - The buttons are named "a", "b", "c" in their order.
+    - The buttons are named "a", "b", "c", in the device's own order.
 """
 
 from collections.abc import Mapping
@@ -23,9 +23,9 @@ class DeviceState(NamedTuple):
     True
 
     Attributes:
-        position_m: Position in m. The origin is arbitrary, because only changes are used.
+        position_m: Position in m. The origin is arbitrary, because only changes matter.
         velocity_m_s: Velocity in m/s.
-        buttons: For each button by its name, True if it is pressed.
+        buttons: Mapping from button name to True if the button is pressed.
     """
 
     position_m: Vector
@@ -36,9 +36,9 @@ class DeviceState(NamedTuple):
 class Device(Protocol):
     """Interface of an input device with which a person moves a robot arm.
 
-    An example is a haptic device. Its motion moves the target that the arm follows. The device
-    is read `rate_hz` times a second. To support another device, a user writes a class with
-    these methods.
+    An example is a haptic device, whose motion moves the target that the arm follows. The
+    device is read `rate_hz` times a second. To support another device, write a class with these
+    methods.
 
     A device is a context manager. If the connection to the device is lost, the `with` block is
     left and entered again.
@@ -59,20 +59,20 @@ class Device(Protocol):
         """Sets the device's force to zero, and closes the connection to the device."""
 
     def read(self) -> DeviceState:
-        """Returns the newest motion of the device's handle and the state of its buttons.
+        """Returns the latest motion of the device's handle and the state of its buttons.
 
-        The method is called `rate_hz` times a second.
+        Called `rate_hz` times a second.
 
         Raises:
-            OSError: The device does not respond, or was disconnected. The caller then leaves
-                the `with` block of the device, and connects again.
+            OSError: The device does not respond or has been disconnected. The caller then
+                leaves the device's `with` block and reconnects.
         """
 
     def render(self, force_n: Vector) -> None:
-        """Applies a force with the device's motors to the person who holds the handle.
+        """Applies a force in N, using the device's motors, to the person who holds the handle.
 
-        The method of a device without motors does nothing.
+        For a device without motors, this method does nothing.
 
         Args:
-            force_n: Coordinates x, y and z of the force, in N.
+            force_n: Force vector (x, y, z), in N.
         """

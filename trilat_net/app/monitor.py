@@ -1,10 +1,8 @@
-"""Shows a running session in a terminal, with one row per site.
-
-A site is a process that controls one robot arm, and exchanges its state with the other sites.
+"""Displays a running session in a terminal, with one row per site.
 
 The commands `trilat demo` and `trilat watch` use this module. In a terminal, the rows form a
-table that is refreshed four times a second. If the output is a file or a pipe, the same rows
-are printed as lines every two seconds.
+table that is refreshed four times a second. If the output is a file or a pipe, the rows are
+printed as plain lines every two seconds.
 """
 
 from collections.abc import Sequence
@@ -54,9 +52,9 @@ LOUD_EVENTS = frozenset(
 
 
 class StatusRow(dict[str, str]):
-    """The row of a site in the table: texts by the headings of the columns.
+    """One site's row in the table, as a mapping from column heading to cell text.
 
-    Unknown texts are empty.
+    Cells whose content is unknown are empty.
     """
 
     @classmethod
@@ -70,18 +68,17 @@ class StatusRow(dict[str, str]):
         ended: bool = False,
         silent_s: float = 0.0,
     ) -> "StatusRow":
-        """Composes the row of one arm: mode, joint angles, torque and so on.
+        """Builds the row of one site, with its mode, joint angles, torque and so on.
 
-        The texts are composed from the newest record and statistics of the arm's process, its
-        site.
+        The cells are filled from the latest record and statistics of the site.
 
         Args:
             scenario: Scenario of the session.
             name: Name of the site.
-            record: Result of the site's newest tick. `None` if no record has arrived.
-            stats: Newest statistics of the site. `None` if no statistics have arrived.
-            ended: True if the site has published its end.
-            silent_s: Time since the last message of the site arrived, in s.
+            record: Record of the site's latest tick. `None` if no record has arrived.
+            stats: Latest statistics of the site. `None` if no statistics have arrived.
+            ended: True if the site has announced that it ended.
+            silent_s: Time since the last message from the site arrived, in s.
         """
         row = cls(dict.fromkeys(_HEADINGS, ""), site=name, mode="braked")
         if stats is not None:
@@ -111,12 +108,12 @@ class StatusRow(dict[str, str]):
 
     @classmethod
     def of_pose(cls, name: str, t_s: float, q: Sequence[float]) -> "StatusRow":
-        """Composes the row of an arm of which only the pose at one time is known.
+        """Builds the row of an arm for which only the pose at one time is known.
 
         Args:
             name: Name of the site.
             t_s: Time of the pose, in s.
-            q: Joint angles in rad. Empty if the pose is not known either.
+            q: Joint angles in rad. Empty if the pose is also unknown.
         """
         row = cls(dict.fromkeys(_HEADINGS, ""), site=name)
         if q:
@@ -125,9 +122,9 @@ class StatusRow(dict[str, str]):
         return row
 
     def describe(self) -> str:
-        """Returns the state of the arm as a line, for an output that cannot show a table.
+        """Formats the row as a line of text, for output that cannot show a table.
 
-        The line contains only the most important columns.
+        Only the most important columns are included.
         """
         headings_by_label = {
             "|e|": "|e|",
@@ -228,9 +225,9 @@ def _frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
 
 
 class SessionDisplay:
-    """Terminal output of a running session: a table of the arms, and lines above it.
+    """Terminal output of a running session: a table of the sites, with messages above it.
 
-    The object is a context manager that restores the terminal.
+    Used as a context manager, which restores the terminal on exit.
 
     Args:
         console: The terminal.
@@ -257,18 +254,18 @@ class SessionDisplay:
         """True if enough time has passed since the last update of the display.
 
         A table in a terminal is updated more often than lines in a file. The rate is limited,
-        because drawing takes time and no reader could follow faster changes.
+        because drawing takes time and nobody could follow faster changes.
         """
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
-        """Prints a line, such as an event, that stays in the terminal above the table of arms.
+        """Prints a line, such as an event, above the table.
 
-        The table below the line is refreshed repeatedly.
+        The line stays in place while the table below it is refreshed.
 
         Args:
-            text: The line.
+            text: The line to print.
         """
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
@@ -278,14 +275,14 @@ class SessionDisplay:
         rows: Sequence[StatusRow],
         alarms: Sequence[tuple[str, LifeAlarm]] = (),
     ) -> None:
-        """Refreshes the table of the arms in the terminal, and the alarms above the table.
+        """Refreshes the table of sites, and the alarms above it.
 
-        An alarm remains visible as long as it is present.
+        An alarm is shown for as long as it persists.
 
         Args:
             title: Title of the table.
             rows: Rows of the sites.
-            alarms: Name of the site and the alarm, for each alarm that is present.
+            alarms: Pairs of site name and alarm, for each current alarm.
         """
         self._updated_ns = self._clock.monotonic_ns()
         if self._live is None:  # the output is not a terminal
@@ -309,20 +306,19 @@ class SessionDisplay:
 
 
 class SessionMonitor:
-    """Receives the messages of all arms of a session, and shows them on a display.
+    """Receives the messages of all sites of a session, and shows them on a display.
 
-    The program of a user who watches the session creates this object and calls `poll`
-    repeatedly.
+    A program that watches a session creates one monitor and calls `poll` repeatedly.
 
     Args:
         bus: Network connection that reaches the session.
         session: Name of the session.
         scenario: Scenario of the session.
-        display: Display on which the state of each site is one row of a table.
+        display: Display that shows the state of each site as a table row.
 
     Attributes:
-        latest: Newest statistics of each site, by name.
-        records: Newest record of each site, by name.
+        latest: Latest statistics of each site, keyed by site name.
+        records: Latest record of each site, keyed by site name.
     """
 
     def __init__(
@@ -344,9 +340,9 @@ class SessionMonitor:
             self._states[name] = bus.inbox(topics.key(session, name, topics.STATE), 1)
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and refreshes the display if that is due.
+        """Processes the messages that have arrived, and refreshes the display when due.
 
-        Important events are printed as lines above the table. The method does not wait.
+        Important events are printed above the table. This method never blocks.
         """
         scenario = self._scenario
         for stats in read_messages(self._links, LinkStats):

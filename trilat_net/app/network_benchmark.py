@@ -1,16 +1,14 @@
-"""Measures a network before a session, and states whether it is good enough for a scenario.
+"""Measures a network before a session, and reports whether it is good enough for a scenario.
 
-This process sends messages to a process on another machine (`trilat ping --answer`), which
-sends each of them back at once. The round trip times and the lost messages are measured for
-several message sizes, message rates and protocols, and compared with the delay and the loss
-that the scenario tolerates. The command is `trilat ping --benchmark`. The two processes are
-called the near end and the far end.
+This process (the near end) sends messages to a process on another machine (the far end, started
+with `trilat ping --answer`), which returns each of them immediately. Round-trip times and
+message losses are measured for several message sizes, message rates and protocols, and compared
+with the delay and loss that the scenario tolerates. The command is `trilat ping --benchmark`.
 
 Invariant:
-    - The benchmark measures the network as a session would use it. Its messages have the size,
-      rate, priority and network settings of samples, the states that the arms send to each
-      other.
-    - The benchmark disturbs no session, because it uses a session name of its own.
+    - The benchmark uses the network as a session would. Its messages have the size, rate,
+      priority and network settings of samples, the states that the arms send to each other.
+    - The benchmark disturbs no session, because it uses a separate session name.
 """
 
 import math
@@ -87,21 +85,21 @@ def _parse_header(payload: bytes) -> tuple[int, ...] | None:
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
-    """Sends each test message of a network benchmark back, until the connection is closed.
+    """Returns each test message of a network benchmark to its sender, until the bus is closed.
 
-    This is the work of the far end. The near end measures the round trip times.
+    Runs at the far end, while the near end measures the round-trip times.
 
     Args:
         bus: Network connection of the far end.
-        member: Name of the far end, under which its messages are published.
+        member: Name under which the far end publishes its messages.
     """
     publish = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
-        """Sends a message of a benchmark back to its sender, marked as a reply.
+        """Returns a benchmark message to its sender, marked as a reply.
 
-        Replies are not sent back, because they would circulate for ever. Messages without the
-        header of a benchmark are ignored.
+        Replies are not returned again, as they would circulate forever. Messages without the
+        benchmark header are ignored.
         """
         header = _parse_header(payload)
         if header is None:
@@ -116,8 +114,8 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
 class NearEnd:
     """Sends messages to the far end, and measures when they come back.
 
-    The far end sends each message back at once, so the near end can measure round trip times
-    with its own clock.
+    The far end returns each message immediately, so round-trip times can be measured with the
+    near end's clock alone.
 
     Args:
         bus: Network connection of the near end.
@@ -154,9 +152,9 @@ class NearEnd:
                     yield number, arrived_ns - sent_ns
 
     def wait_for_far_end(self) -> bool:
-        """Waits until the far end, the process that sends messages back, can be reached.
+        """Waits until the far end can be reached.
 
-        Messages are sent repeatedly, because the connection may not be complete yet.
+        Messages are sent repeatedly, because the connection may still be being set up.
 
         Returns:
             True once the far end has replied. False if it does not reply within `CONNECT_NS`.
@@ -171,9 +169,9 @@ class NearEnd:
         return False
 
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
-        """Sends messages at a constant rate, and measures their round trips.
+        """Sends messages at a constant rate, and measures their round-trip times in s.
 
-        The message rate does not depend on the replies, so the load equals that of a real
+        The message rate does not depend on the replies, so the load is the same as in a real
         session.
 
         Args:
@@ -182,7 +180,7 @@ class NearEnd:
             duration_s: Time for which messages are sent, in s. At least 10 messages are sent.
 
         Returns:
-            Round trip time of each message in s. NaN for messages without a reply.
+            Round-trip time of each message, in s. NaN for messages without a reply.
         """
         count = max(10, round(rate_hz * duration_s))
         clock = self._clock
@@ -190,12 +188,12 @@ class NearEnd:
         first_number = self._number
 
         def count_missing() -> int:
-            """Stores the round trip times of messages that have come back meanwhile.
+            """Stores the round-trip times of newly returned messages, and counts the rest.
 
             Replies to messages of earlier measurements are ignored.
 
             Returns:
-                The number of messages of this measurement that have not come back yet.
+                Number of messages of this measurement that have not come back yet.
             """
             for number, round_trip_ns in self._read_replies():
                 if number >= first_number:
@@ -274,16 +272,16 @@ def run_far_end(
     insecure: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Runs the far end of a network benchmark, which sends every test message back.
+    """Runs the far end of a network benchmark, which returns every test message.
 
-    It runs on the other machine, where the user starts it with `trilat ping --answer`.
+    The user starts it on the other machine with `trilat ping --answer`.
 
     Args:
-        endpoints: Endpoints to listen at.
-        keys: Folder with the keys of a site, for encrypted endpoints.
-        stopped: Function that returns True to end the call.
-        duration_s: Longest duration, in s.
-        insecure: True to permit connections without keys, because everybody on the network is
+        endpoints: Endpoints to listen on.
+        keys: Folder with a site's keys, for encrypted endpoints.
+        stopped: Function that returns True when the far end must stop.
+        duration_s: Maximum duration, in s.
+        insecure: True to allow connections without keys, because everybody on the network is
             trusted.
         say: Function that prints a line for the user.
 
@@ -340,24 +338,24 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
 
 
 class NetworkNeeds(NamedTuple):
-    """Demands of a scenario on the network: message size, message rate and largest delay.
+    """Network requirements of a scenario: message size, message rate and maximum delay.
 
-    The demands are computed from the rate of the control loops, and from the delays for which
-    they are stable.
+    They are computed from the rate of the control loops and from the delays for which the loops
+    are stable.
 
     Attributes:
         sample_bytes: Size of a sample of the largest arm, in bytes.
-        rate_hz: Largest tick rate of a site, in 1/s.
+        rate_hz: Highest tick rate of any site, in 1/s.
         playout_ms: Smallest play-out delay of the links. A play-out delay holds each sample
-            until it has a fixed age, and so replaces varying network delays with a constant
-            delay.
-        held_ms: Shortest time for which a link holds its samples, by a play-out delay or by the
-            constant delay that the scenario prescribes.
-        in_use_ms: Part of the age of the samples in use that the scenario's links cause. `None`
-            if the linear theory does not cover the scenario.
+            until it reaches a fixed age, which turns varying network delays into a constant
+            one.
+        held_ms: Shortest time for which a link holds its samples, due to a play-out delay or to
+            a constant delay set in the scenario.
+        in_use_ms: The part of the age of the samples in use that is caused by the scenario's
+            links. `None` if the linear theory does not cover the scenario.
         stable_ms: Intervals of the delay of all links for which the control loop is stable.
             `None` if the linear theory does not cover the scenario.
-        words: Sentence for the user about these intervals, or the reason why the theory does
+        words: Explanation of these intervals for the user, or the reason why the theory does
             not cover the scenario.
     """
 
@@ -371,13 +369,13 @@ class NetworkNeeds(NamedTuple):
 
     @classmethod
     def of_scenario(cls, scenario: Scenario) -> "NetworkNeeds":
-        """Computes the delay, message size and message rate that a scenario demands.
+        """Computes the delay, message size and message rate that a scenario requires.
 
-        The delays for which the control loop is stable are computed by its linear analysis,
-        which takes as long as the command `trilat linear`.
+        The stable delays are computed by a linear analysis of the control loop, which takes as
+        long as the command `trilat linear`.
 
         Args:
-            scenario: The scenario, which describes the arms, their links and the run.
+            scenario: The scenario to analyse.
         """
         links = list(scenario.links.values())
         held_ms = [max(link.playout_ms, link.constant_delay_ms or 0.0) for link in links]
@@ -416,20 +414,20 @@ class NetworkNeeds(NamedTuple):
         )
 
     def judge(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Judges whether a network is good enough for a scenario.
+        """Decides whether a network is good enough for the scenario.
 
-        A sample is the state that a site publishes in each tick, a period of its control loop.
-        The receiver uses it from its first tick after the sample has arrived. Samples therefore
-        have an age of whole ticks. The 99th percentile of the network delay counts. It has no
-        effect if it is shorter than the time for which the scenario itself holds samples. The
-        network is good if the loop is stable at that age, and if at most `MAX_LOST` of the
-        samples are lost.
+        A sample is the state that a site publishes in each tick (a period of its control loop).
+        The receiver uses a sample from the first tick after its arrival, so the age of a sample
+        is an integer number of ticks. The age is computed from the 99th percentile of the
+        network delay, which has no effect if it is shorter than the time for which the scenario
+        itself holds samples. The network is good enough if the loop is stable at that age, and
+        if at most a fraction `MAX_LOST` of the samples is lost.
 
         Args:
             row: Measurement at the scenario's own message size and rate.
 
         Returns:
-            The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are
+            The fields of a verdict, as printed by `trilat ping --benchmark --json`. Times are
             `None` if no message came back.
         """
         fields = {
@@ -490,20 +488,19 @@ def _measure_sample(scenario: Scenario) -> int:
 
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
-    """Result of measuring whether the network is good enough for a scenario.
+    """Result of a benchmark that measures whether the network is good enough for a scenario.
 
-    There is a verdict for each transport, the protocol that carries the messages: TCP, TLS or
-    QUIC.
+    There is one verdict per transport (TCP, TLS or QUIC).
 
     Attributes:
         scenario: Name of the scenario.
-        duration_s: Duration of all cases together, in s.
+        duration_s: Total duration of all cases, in s.
         needs: Requirements of the scenario.
         rows: Measurements, one row per message size, message rate and transport.
-        judged: Verdict for each transport on whether it is good enough, see
+        judged: For each transport, the verdict on whether it is good enough; see
             `NetworkNeeds.judge`.
         connect: Endpoints of the far end on another machine. Empty if both ends ran on this
-            machine, and no network was measured.
+            machine, in which case no network was measured.
     """
 
     scenario: str
@@ -517,16 +514,15 @@ class NetworkBenchmark(Result):
     def good(self) -> bool:
         """True if the network is good enough for the scenario with every measured transport.
 
-        Transports are TCP, TLS and QUIC. The exit code of `trilat ping --benchmark` depends on
-        this property.
+        This determines the exit code of `trilat ping --benchmark`.
         """
         return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat ping --benchmark --json` prints them.
+        """Converts the result to the plain values that `trilat ping --benchmark --json` prints.
 
-        "needs" states what the scenario requires of the network, "transports" judges each
-        transport, and "rows" has the measurements.
+        "needs" contains the requirements of the scenario, "transports" the verdict on each
+        transport, and "rows" the measurements.
         """
         return {
             "scenario": self.scenario,
@@ -541,8 +537,8 @@ class NetworkBenchmark(Result):
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns one table row per message size, message rate and transport, with times in us.
 
-        The one-way times are in the columns "p50_us", "p99_us" and "max_us". They are `None` if
-        no message came back.
+        The columns "p50_us", "p99_us" and "max_us" contain one-way times. They are `None` if no
+        message came back.
         """
         flat_rows = []
         for row in self.rows:
@@ -555,8 +551,8 @@ class NetworkBenchmark(Result):
     def blocks(self) -> Iterator[Any]:
         """Returns the table and the verdicts that `trilat ping --benchmark` prints.
 
-        The module that composes the texts is imported inside this method, because a program
-        that only reads the numbers does not need it.
+        The formatting module is imported inside this method, because a program that only reads
+        the results does not need it.
         """
         from ..presentation import compose_benchmark
 
@@ -571,26 +567,26 @@ def ping_benchmark(
     connect: Sequence[str] | None = None,
     keys: str | Path | None = None,
 ) -> NetworkBenchmark:
-    """Measures a network and judges it for a scenario, as `trilat ping --benchmark` does.
+    """Measures whether a network suits a scenario, as `trilat ping --benchmark` does.
 
     >>> found = tn.ping_benchmark("p_d_margin", duration_s=2)
     >>> [row["transport"] for row in found.to_dict()["transports"]]
     ['tcp', 'tls', 'quic']
 
     Args:
-        scenario: The name of a shipped scenario, a path, a TOML text, the tables of a scenario,
-            or a scenario.
-        set: Settings that replace those of the scenario, as in `{"link.model": "measured"}`.
-        duration_s: Duration of all cases together, in s.
-        connect: Endpoints at which `trilat ping --answer` runs. If `None`, a far end is started
-            on this machine, for TCP, TLS and QUIC.
-        keys: Folder with the keys of a site, for encrypted endpoints.
+        scenario: Name of a shipped scenario, path of a TOML file, TOML string, mapping of its
+            tables, or `Scenario`.
+        set: Overrides of scenario settings, for example `{"link.model": "measured"}`.
+        duration_s: Total duration of all cases, in s.
+        connect: Endpoints on which `trilat ping --answer` listens. If `None`, a far end is
+            started on this machine, for TCP, TLS and QUIC.
+        keys: Folder with a site's keys, for encrypted endpoints.
 
     Returns:
         The measurements and the verdicts.
 
     Raises:
-        ScenarioError: The scenario is not valid.
+        ScenarioError: The scenario is invalid.
         UsageError: An endpoint or the keys cannot be used.
         RunFailed: No far end replies at an endpoint.
     """

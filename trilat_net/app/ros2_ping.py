@@ -1,7 +1,7 @@
-"""Measures the delays of the messages on a ROS 2 topic, for `trilat ping --ros2`.
+"""Measures the delays of messages on a ROS 2 topic, for `trilat ping --ros2`.
 
-ROS 2 is the Robot Operating System. Each message of its programs contains the time at which it
-was sent, so the delay is known on arrival.
+ROS 2 is the Robot Operating System. Every message contains the time at which it was sent, so
+its delay is known on arrival.
 
 Invariant:
     - The measurement does not disturb the publishers. This process only receives.
@@ -35,19 +35,20 @@ def ping_topic(
     lasts_s: float,
     report: Callable[[str], None],
 ) -> "TopicDelays":
-    """Measures the delays of a topic of the ROS 2 programs that a router connects.
+    """Measures the delays of the messages on a ROS 2 topic, received through a Zenoh router.
 
-    Ctrl-C ends the measurement earlier.
+    Ctrl-C ends the measurement early.
 
     Args:
         topic: Name of the topic.
-        routers: Endpoints of the Zenoh router of ROS. The first endpoint that answers is used.
-        domain: Number of the ROS domain.
+        routers: Endpoints of the Zenoh router used by ROS. The first endpoint that answers is
+            used.
+        domain: ROS domain ID.
         lasts_s: Duration of the measurement, in s.
-        report: Function that receives a sentence about messages that could not be used.
+        report: Function that is called with a sentence about messages that could not be used.
 
     Raises:
-        UsageError: The name of the topic is not valid.
+        UsageError: The name of the topic is invalid.
         RouterSilent: No router answers.
         RunFailed: No program has published on the topic.
     """
@@ -87,18 +88,18 @@ class TopicDelays(Result):
     publishers: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table row for each program that publishes on the ROS 2 topic.
+        """Returns one table row per program that publishes on the topic.
 
-        A row contains the number of messages of the program, and their delays.
+        Each row contains the number of messages from that program, and their delays.
         """
         return self.publishers
 
     def blocks(self) -> Iterator[Any]:
         """Yields the table of delays that `trilat ping --ros2` prints.
 
-        There is a row per publishing program. The last column is a histogram of the delays,
-        from the smallest to the largest one. The class of the table is imported inside this
-        method, because a program that only reads the numbers does not need it.
+        There is one row per publishing program. The last column is a histogram of the delays,
+        from smallest to largest. The table class is imported inside this method, because a
+        program that only reads the results does not need it.
         """
         from ..presentation import TextTable
 
@@ -138,17 +139,17 @@ class TopicDelays(Result):
         lasts_s: float,
         stopped: Callable[[], bool],
     ) -> "TopicDelays":
-        """Measures the delays of a ROS 2 topic, from the sending time in each message.
+        """Measures the delays of messages on a ROS 2 topic from their sending times.
 
-        The method receives the messages of the topic for some time, and then evaluates them
-        for each program that publishes on the topic.
+        Receives messages for the given duration, then evaluates them for each publishing
+        program.
 
         Args:
             graph: Connection to the ROS 2 programs.
             clock: Clock of this process.
             topic: Name of the topic.
             lasts_s: Duration of the measurement, in s.
-            stopped: Function that returns True to end the measurement earlier.
+            stopped: Function that returns True to end the measurement early.
 
         Raises:
             RunFailed: No program has published on the topic.
@@ -158,14 +159,13 @@ class TopicDelays(Result):
         types: dict[bytes, str] = {}
 
         def receive(kind: str, attachment: Attachment) -> None:
-            """Stores the number and the delay of a ROS 2 message for the program that sent it.
+            """Stores the number and the delay of a ROS 2 message under its publisher.
 
-            The function is called in a thread of the network library Zenoh.
+            Called in a Zenoh thread.
 
             Args:
                 kind: Type of the message.
-                attachment: Additional data of the message: its publisher, number and sending
-                    time.
+                attachment: Metadata of the message: its publisher, number and sending time.
             """
             delay_ns = clock.unix_ns() - attachment.sent_unix_ns
             types[attachment.gid] = kind

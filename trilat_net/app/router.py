@@ -1,7 +1,7 @@
 """Runs the router process, through which members of sessions reach each other.
 
 Invariant:
-    - A router forwards the messages of all sessions. It prints which processes join and leave.
+    - A router forwards the messages of all sessions, and prints which processes join and leave.
 """
 
 import math
@@ -25,9 +25,9 @@ def run_router(
     Members that cannot reach each other directly communicate through a router.
 
     Args:
-        bus: Network connection of the router, which forwards the messages by itself.
+        bus: Network connection of the router. The connection itself forwards the messages.
         clock: Clock of this process.
-        stopped: Function that returns True to end the router.
+        stopped: Function that returns True when the router must end.
         say: Function that prints a line for the user.
         until_idle_s: Time after which the router ends once the last member has left, in s. If
             None, the router does not end by itself.

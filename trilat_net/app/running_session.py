@@ -1,18 +1,18 @@
 """Controls a running session from Python: stops arms, changes links, moves arms, reads records.
 
-A session is a set of processes ("sites") that each run one arm, and that exchange the states of
-their arms over the network. `session` returns a `RunningSession`, whose methods send requests
-to the sites and return their replies. `hand` lets a program act as the operator of an arm.
-`start` starts a process of a session, as a terminal would.
+A session is a set of processes (sites) that each run one arm and exchange the states of their
+arms over the network. `session` returns a `RunningSession`, whose methods send requests to the
+sites and return their replies. `hand` lets a program act as the operator of an arm. `start`
+starts a process of a session, as a terminal would.
 
 The commands `trilat stop`, `enable`, `reset`, `set`, `ping` and `hand` use the same functions.
 
 Invariant:
-    - Each call opens a connection to the session, and closes it at its end, as the command of
-      the same name does. A `RunningSession` therefore remains usable if sites come and go
+    - Each call opens a connection to the session and closes it before returning, like the
+      command of the same name. A `RunningSession` therefore remains usable if sites come and go
       between calls.
-    - In a `with` block over a `RunningSession`, all calls use one connection, which the end of
-      the block closes.
+    - In a `with` block over a `RunningSession`, all calls share one connection, which is closed
+      at the end of the block.
 """
 
 import subprocess
@@ -79,11 +79,11 @@ def _never_stopped() -> bool:
 
 
 class ShareHistory:
-    """Weights with which an arm follows the others, as functions of the time in a session.
+    """Tracks how the dominance factors of an arm change over the time of a session.
 
-    Such a weight is called a dominance factor. The scenario states the initial factors and
-    planned changes. Users request further changes during the session. Each change is a linear
-    ramp from the present factors to new factors.
+    A dominance factor is the weight with which the arm follows another arm. The scenario sets
+    the initial factors and planned changes, and users may request more changes during the
+    session. Each change is a linear ramp from the current factors to new ones.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -94,12 +94,12 @@ class ShareHistory:
         self._shares_before = self._ramp.alpha
 
     def add_change(self, change: str) -> None:
-        """Adds a change of dominance factors, which an arm's process has reported as an event.
+        """Adds a change of dominance factors that a site has reported as an event.
 
-        Changes of other settings are ignored, and so are texts that do not describe a change.
+        Changes of other settings, and strings that do not describe a change, are ignored.
 
         Args:
-            change: Text of the change, from the field `command` of the event.
+            change: Description of the change, from the field `command` of the event.
         """
         with suppress(ScenarioError):  # raised if the text is not a change
             ramp = parse_core_change(self._scenario, self._site, change).ramp
@@ -108,13 +108,11 @@ class ShareHistory:
                 self._later_ramps.append(ramp)
 
     def advance_to(self, t_ns: int) -> tuple[float, ...]:
-        """Computes the dominance factors of an arm at a given time of the session.
-
-        A dominance factor is the weight, from 0 to 1, with which the arm follows another arm.
+        """Computes the dominance factors (0 to 1) of an arm at a given time of the session.
 
         Args:
-            t_ns: The time, in ns after the start of the session. It must not be earlier than in
-                the previous call.
+            t_ns: Time in ns after the start of the session. It must not be earlier than in the
+                previous call.
 
         Returns:
             One factor per peer, in the order of the site's peers.
@@ -140,16 +138,16 @@ class ShareHistory:
 
 
 class RunningSession:
-    """A session that is running, to be controlled and observed from Python.
+    """A running session that can be controlled and observed from Python.
 
-    `session` creates this object. Most methods send a request to some sites, the processes that
-    run one arm each. They return the replies, one sentence for each site.
+    Create one with `session`. Most methods send a request to one or more sites (the processes
+    that each run one arm) and return the replies, one sentence per site.
 
     Args:
         name: Name of the session.
-        connection: Endpoints of the session and keys of a member.
+        connection: Endpoints of the session, and the keys of a member.
         bus: An open network connection to the session. If `None`, each call opens a connection.
-        clock: Clock of this process. If `None`, a clock is created.
+        clock: Clock of this process. If `None`, a new clock is created.
     """
 
     def __init__(
@@ -191,17 +189,17 @@ class RunningSession:
     ) -> Iterator[Bus]:
         """Opens a network connection to the session, as a context manager.
 
-        In a session whose members prove their identities with keys, a request is accepted only
-        from a member that is permitted to send it. Most requests need the keys of the operator.
+        If the members of the session authenticate with keys, a site accepts a request only from
+        a member that is allowed to send it. Most requests need the operator's keys.
 
         Args:
-            member: Name of the member under which the requests will be sent. If this object has
-                keys, they must be the keys of that member. If `member` is empty, the keys of
-                any member are accepted.
-            timeout_s: Longest wait for the reply of a site, in s.
+            member: Name of the member that sends the requests. Any keys that this object has
+                must belong to that member. If `member` is empty, the keys of any member are
+                accepted.
+            timeout_s: Maximum time to wait for the reply of a site, in s.
 
         Yields:
-            The connection. It is closed at the end of the `with` block, unless it was given to
+            The connection. It is closed at the end of the `with` block, unless it was passed to
             this object.
 
         Raises:
@@ -227,17 +225,16 @@ class RunningSession:
 
     @contextmanager
     def reach_site(self, site: str, timeout_s: float) -> Iterator[tuple[Bus, Scenario]]:
-        """Waits until the process of an arm runs, and connects to its session.
+        """Waits until a site is running, and connects to its session, as a context manager.
 
-        Such a process is called a site. This is a context manager, and the connection is closed
-        at the end of the `with` block.
+        The connection is closed at the end of the `with` block.
 
         Args:
             site: Name of the site.
-            timeout_s: Longest wait, in s.
+            timeout_s: Maximum time to wait, in s.
 
         Yields:
-            The network connection, and the scenario (description) of the session.
+            The network connection, and the scenario of the session.
 
         Raises:
             SessionError: The session has no such site, or the site does not run in time.
@@ -270,12 +267,12 @@ class RunningSession:
         The command `trilat hand --device` does the same.
 
         Args:
-            site: Name of the site, the process that controls the arm. The scenario contains the
-                settings of the device for this site.
+            site: Name of the site that controls the arm. The device settings for this site are
+                part of the scenario.
             device: The input device.
-            stopped: Function that returns True to end the call earlier.
-            say: Function that receives each line of text for the user.
-            timeout_s: Longest wait until the session runs, in s.
+            stopped: Function that returns True to end the call early.
+            say: Function that prints a line for the user.
+            timeout_s: Maximum time to wait until the session runs, in s.
 
         Raises:
             SessionError: The session does not exist, or does not begin in time.
@@ -313,7 +310,7 @@ class RunningSession:
             say(f"{site}: {device_hand.describe()}")
 
     def stop(self, *sites: str) -> list[str]:
-        """Stops some arms at once, while the other arms of the session continue.
+        """Stops the given arms at once, while the rest of the session continues.
 
         The command `trilat stop` does the same.
 
@@ -322,43 +319,42 @@ class RunningSession:
                 stop.
 
         Returns:
-            The reply of each site as a sentence, in the order of the sites.
+            The sites' replies, one sentence each, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "stop"))
 
     def enable(self, *sites: str) -> list[str]:
-        """Lets arms that were stopped follow the other arms of the session again.
+        """Lets stopped arms follow the other arms of the session again.
 
         The command `trilat enable` does the same.
 
         Args:
-            *sites: Names of the sites, the processes that each control one arm. All sites if no
-                name is given.
+            *sites: Names of the sites. Default: all sites.
 
         Returns:
-            The reply of each site as a sentence, in the order of the sites.
+            The sites' replies, one sentence each, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "enable"))
 
     def reset(self, *sites: str) -> list[str]:
-        """Clears the fault of arms, such as lost measurements, so that they can move again.
+        """Clears faults of arms, such as lost measurements.
 
-        The arms can then be enabled. A fault whose reason persists is not cleared. The command
-        `trilat reset` does the same.
+        The arms can then be enabled again. A fault whose cause persists is not cleared. The
+        command `trilat reset` does the same.
 
         Args:
-            *sites: Names of the sites. All sites if no name is given.
+            *sites: Names of the sites. Default: all sites.
 
         Returns:
-            The reply of each site as a sentence, in the order of the sites.
+            The sites' replies, one sentence each, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "reset"))
 
     def send_order(self, sites: Sequence[str], order: OrderName) -> list[ChangeReply]:
-        """Sends an order such as "stop" to some sites, and waits for their replies.
+        """Sends an order such as "stop" to the given sites, and waits for their replies.
 
-        A site is the process that controls one robot arm. If one of the sites does not run, no
-        order is sent. The user thus learns of a misspelled name before any arm reacts.
+        If any of the sites is not running, the order is sent to none of them. A misspelled name
+        is therefore reported before any arm reacts.
 
         Args:
             sites: Names of the sites. If empty, the order is sent to all sites, or to all sites
@@ -409,10 +405,11 @@ class RunningSession:
     def end(self) -> list[str]:
         """Ends the session for all arms at the same time, as `trilat stop --end` does.
 
-        The end is about half a second ahead, so that all processes receive the request in time.
+        The end is scheduled about half a second ahead, so that all processes receive the
+        request in time.
 
         Returns:
-            The reply of each site as a sentence, in the order of the sites.
+            The sites' replies, one sentence each, in the order of the sites.
 
         Raises:
             SessionError: The session has not begun, or a site does not reply.
@@ -532,15 +529,16 @@ class RunningSession:
     def set_link(self, link: str, **to: Any) -> str:
         """Changes settings of a link while the session runs, as `trilat set link` does.
 
-        A link is the connection in one direction between two sites, the processes that each run
-        one arm. Its settings are, for example, an additional delay or loss.
+        A link is a one-way connection between two sites. Its settings include, for example, an
+        additional delay or loss.
 
         Args:
-            link: The link, as in "m1->s" for the direction from site m1 to site s.
-            **to: The new settings, as in `delay_ms=350`.
+            link: Name of the link, for example "m1->s" for the direction from site m1 to site
+                s.
+            **to: The new settings, for example `delay_ms=350`.
 
         Returns:
-            The reply of the receiving site, which carries out the change, as a sentence.
+            The reply, as a sentence, of the receiving site, which carries out the change.
 
         Raises:
             RunFailed: The site has refused the change.
@@ -550,13 +548,13 @@ class RunningSession:
     def set_dominance(self, site: str, shares: Mapping[str, float], ramp_s: float = 1.0) -> str:
         """Changes the weights with which an arm follows the other arms.
 
-        The change can pass the lead of the arm from one operator to another, for example from a
-        trainer to a trainee. The command `trilat set dominance` does the same.
+        This can hand the lead from one operator to another, for example from a trainer to a
+        trainee. The command `trilat set dominance` does the same.
 
         Args:
             site: Name of the site.
-            shares: New weight of each peer (the other sites that the site follows), as in
-                `{"m1": 0.9, "m2": 0.1}`.
+            shares: New weight of each peer that the site follows, for example `{"m1": 0.9,
+                "m2": 0.1}`.
             ramp_s: Duration of the change, in s.
 
         Returns:
@@ -586,13 +584,13 @@ class RunningSession:
         return reply.text
 
     def change(self, site: str, request: ChangeRequest) -> ChangeReply:
-        """Requests a change of a setting, such as another link delay, from one running arm.
+        """Asks a running site to change a setting, such as the delay of a link.
 
-        An arm's process carries out the change at its next tick, a period of its control loop.
+        The site carries out the change at its next tick.
 
         Args:
             site: Name of the site.
-            request: The requested change, for example of the delay of a link.
+            request: The requested change.
 
         Returns:
             The reply of the site, accepted or refused.
@@ -607,15 +605,16 @@ class RunningSession:
 
     @contextmanager
     def records(self, *sites: str) -> Iterator[Callable[[], list[State]]]:
-        """Subscribes to the records of some sites, as a context manager.
+        """Subscribes to the records of the given sites, as a context manager.
 
-        A record is the stored result of one tick of a site's control loop.
+        A record holds everything that a site measured and computed in one tick of its control
+        loop.
 
         >>> with tn.session("paper").records("s") as receive:  # doctest: +SKIP
         ...     [record.q_des for record in receive()]
 
         Args:
-            *sites: Names of the sites. All sites if no name is given.
+            *sites: Names of the sites. Default: all sites.
 
         Yields:
             A function that returns the records that have arrived since its last call.
@@ -628,9 +627,8 @@ class RunningSession:
                 inboxes.append(bus.inbox(key, STATES_KEPT))
 
             def receive() -> list[State]:
-                """Returns the records of all arms that have arrived since the last call.
+                """Returns the records of the subscribed sites that arrived since the last call.
 
-                A record contains the measurements and results of one period of a control loop.
                 The list is empty if no record has arrived.
                 """
                 return [record for inbox in inboxes for record in read_messages(inbox, State)]
@@ -639,24 +637,23 @@ class RunningSession:
 
     @contextmanager
     def states(self, as_site: str = "") -> Iterator[Callable[[], dict[str, State]]]:
-        """Subscribes to the newest record of each site, as a context manager.
+        """Subscribes to the latest record of each site, as a context manager.
 
-        A record is the result of one tick, a period of a site's control loop. With `as_site`,
-        the records are those that the user of that site sees. They are the newest record of the
-        site itself and, for each peer, the record of the sample that the site uses at present.
-        That sample is older than the newest sample, because the link delays it, or because the
-        scenario delays the picture (`[sites.NAME.view]`). A peer is missing if this record was
-        published before the subscription, or more than `STATES_KEPT` ticks ago.
+        With `as_site`, the records show what the user of that site sees: the latest record of
+        the site itself and, for each peer, the record of the sample that the site is currently
+        using. That sample is older than the peer's latest one, because the link delays it, or
+        because the scenario delays the picture (`[sites.NAME.view]`). A peer is missing if this
+        record was published before the subscription, or more than `STATES_KEPT` ticks ago.
 
         >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
         ...     find()["s"].q
 
         Args:
-            as_site: Name of the site whose view is returned. If empty, the newest records are
+            as_site: Name of the site whose view is returned. If empty, the latest records are
                 returned.
 
         Yields:
-            A function that returns one record of each site, by the name of the site.
+            A function that returns one record per site, keyed by site name.
         """
         with self.reach("") as bus:
             inbox = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
@@ -664,14 +661,12 @@ class RunningSession:
             picture_delay: PictureDelay | None = None  # created when the first record arrives
 
             def find() -> dict[str, State]:
-                """Returns the newest known state of every arm, by the name of its site.
+                """Returns the latest known record of each site, keyed by site name.
 
-                A site is the process that controls an arm. The state is a record, the stored
-                result of one tick (period of a control loop). The dictionary is empty until the
-                first record has arrived.
+                The dictionary is empty until the first record has arrived.
 
-                With `as_site`, the states are those that the user of that site sees. They may
-                be older, because the scenario may delay the user's picture. `picture_delay`
+                With `as_site`, the records show what the user of that site sees. They may be
+                older, because the scenario may delay the user's picture. `picture_delay`
                 computes which tick of each arm the user sees, and `latest_records` keeps the
                 records that arrive from `inbox`.
                 """
@@ -706,14 +701,14 @@ class RunningSession:
             yield find
 
     def mark(self, text: str) -> str:
-        """Stores a text in the log to mark the present moment.
+        """Adds a text mark to the log at the current time.
 
-        For example, a user marks when something remarkable happens, and finds the moment in the
-        log later. The first site of the scenario that is present publishes the mark as an
-        event, which the recorder stores.
+        For example, a user marks a remarkable event in order to find it in the log later. The
+        first site of the scenario that is present publishes the mark as an event, which the
+        recorder stores.
 
         Args:
-            text: Text of the mark, for a reader of the log.
+            text: Content of the mark, for readers of the log.
 
         Returns:
             The reply of the site, as a sentence.
@@ -763,7 +758,7 @@ class RunningSession:
             site: Name of the site.
 
         Yields:
-            A function that returns the present weights, by the name of the peer.
+            A function that returns the current weights, keyed by peer name.
         """
         with self.reach("") as bus:
             info = self._find_running(bus, site)
@@ -778,10 +773,9 @@ class RunningSession:
                 history.add_change(event.command)
 
             def find() -> dict[str, float]:
-                """Returns the present weights with which an arm follows each other arm.
+                """Returns the current weight with which the arm follows each peer, by name.
 
-                The keys are the names of the other arms' sites. The present time is the time of
-                the newest record that has arrived from the arm's process.
+                The current time is that of the latest record received from the site.
                 """
                 nonlocal now_ns
                 for event in read_messages(events, Event):
@@ -794,17 +788,17 @@ class RunningSession:
             yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
-        """Measures round trip times and clock offsets between the processes of the session.
+        """Measures round-trip times and clock offsets to the processes of the session.
 
-        The command `trilat ping` does the same. A member is a process of the session: a site,
-        which runs one arm, or a recorder.
+        The command `trilat ping` does the same. The members measured are the sites and the
+        recorders.
 
         Args:
             count: Number of pings to each member.
-            timeout_s: Longest wait for replies, in s.
+            timeout_s: Maximum time to wait for replies, in s.
 
         Returns:
-            The round trip time to each member, the offset of its clock, and the delays of the
+            The round-trip time to each member, the offset of its clock, and the delays of the
             links between the sites.
         """
         report = ping_session(
@@ -828,8 +822,8 @@ def session(
 ) -> RunningSession:
     """Returns an object that controls and observes a running session.
 
-    Its methods do the same as `trilat stop`, `set` and `ping`. Each of them opens a connection
-    of its own, unless the object is used in a `with` statement.
+    Its methods do the same as `trilat stop`, `set` and `ping`. Each call opens a separate
+    connection, unless the object is used in a `with` statement.
 
     >>> with tn.session("paper") as paper:  # doctest: +SKIP
     ...     paper.mark("look here")
@@ -842,8 +836,8 @@ def session(
         connect: Endpoints of the session, as for --connect. If `None`, the session's own
             endpoint on this machine is used.
         router: Endpoints of routers to connect through instead, as for --router.
-        keys: Folder with the keys of the operator, as for --keys. To stop arms and to ping, the
-            keys of any member suffice.
+        keys: Folder with the operator's keys, as for --keys. The keys of any member are enough
+            to stop arms and to ping.
 
     Raises:
         UsageError: An endpoint or the keys cannot be used.
@@ -855,8 +849,9 @@ def session(
 def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
     """Starts a process of a session, as a terminal would.
 
-    The process runs until it ends by itself, or until the caller terminates it. The commands
-    are `trilat site`, `hand`, `record`, `router`, `replay`, `watch`, `live` and `ros2`.
+    The process runs until it ends by itself, or until the caller terminates it. The available
+    commands are `trilat site`, `hand`, `record`, `router`, `replay`, `watch`, `live` and
+    `ros2`.
 
     >>> recorder = tn.start("record", "--session", "paper", "-o", "run.mcap")  # doctest: +SKIP
     >>> player = tn.start("replay", "run.mcap", "--rate", "2")  # doctest: +SKIP
@@ -866,7 +861,7 @@ def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
         *arguments: The command and its arguments, without `trilat`.
 
     Returns:
-        The process.
+        The running process.
     """
     return subprocess.Popen([sys.executable, "-m", "trilat_net", *map(str, arguments)])
 
@@ -891,21 +886,21 @@ def hand(
     ...     hand.force, hand.pose
 
     Args:
-        session: Name of the session. A session is named after its scenario by default.
-        site: Site of the arm. Its scenario must have an operator of kind "live".
+        session: Name of the session. By default, a session has the name of its scenario.
+        site: Site of the arm. The scenario must give it an operator of kind "live".
         connect: Endpoints of the session, as for --connect. If `None`, the session's own
             endpoint on this machine is used.
         router: Endpoints of routers to connect through instead, as for --router.
-        keys: Folder with the keys of the operator, as for --keys.
-        source: Name of the program or person, which events of the session mention.
-        timeout_s: Longest wait until the session runs, in s.
+        keys: Folder with the operator's keys, as for --keys.
+        source: Name of the program or person, used in events of the session.
+        timeout_s: Maximum time to wait until the session runs, in s.
 
     Yields:
         The connection to the arm.
 
     Raises:
         SessionError: There is no such session, or it does not begin.
-        UsageError: The scenario does not permit a live operator at that arm, or an endpoint
+        UsageError: The scenario does not allow a live operator at that arm, or an endpoint
             cannot be used.
     """
     connection = Connection.of_member(None, connect, router).secure(keys, insecure=False)
@@ -943,12 +938,12 @@ def open_hand(
         session: Name of the session.
         site: Site of the arm.
         scenario: Scenario of the session.
-        source: Name of the program or person, which events of the session mention.
-        repeats: True if a thread repeats the last message regularly, so that the site knows
-            that the program is still running, see `Hand`.
+        source: Name of the program or person, used in events of the session.
+        repeats: True to repeat the last message regularly from a thread, which shows the site
+            that the program is still running; see `Hand`.
 
     Raises:
-        UsageError: The scenario does not permit a live operator at that arm.
+        UsageError: The scenario does not allow a live operator at that arm.
     """
     scenario.find_site(site)
     live = scenario.sites[site].find_live_hand(is_open=True)

@@ -1,10 +1,9 @@
 """Measures the network of a running session.
 
-A session is a run in which processes ("sites") each control one arm. Its members are the sites
-and the recorders, which write the log. A ping is a message to which a member replies at once.
-`ping_session` sends pings to all members of a session, and reports round trip times and the
-offsets of their clocks. It also reports the delays of the links between the sites, which the
-receiving sites measure themselves.
+The members of a session are its sites (the processes that each control one arm) and its
+recorders. A ping is a message to which a member replies at once. `ping_session` pings all
+members, and reports round-trip times and the offsets of their clocks. It also reports the
+delays of the links between the sites, as measured by the receiving sites.
 
 Invariant:
     - The measurement does not disturb the session. This process does not announce itself as a
@@ -51,10 +50,10 @@ class PingReport(Result):
 
     Attributes:
         session: Name of the session.
-        members: One table row per member, with the round trip times of the pings, and the
+        members: One table row per member, with the round-trip times of the pings, and the
             offset of the member's clock from the clock of this process.
-        links: One table row per link, the directed connection between two sites, as the
-            receiving site measures it.
+        links: One table row per link (directed connection between two sites), as measured by
+            the receiving site.
     """
 
     session: str
@@ -64,15 +63,15 @@ class PingReport(Result):
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns one table row per process of the session, for example for pandas.
 
-        The network links between the arms are left out, because they have other columns.
+        Links between the arms are not included, because they have different columns.
         """
         return self.members
 
     def blocks(self) -> Iterator[Any]:
-        """Returns the tables of round trips that `trilat ping` prints.
+        """Returns the tables of round-trip times that `trilat ping` prints.
 
-        The module that composes the texts is imported inside this method, because a program
-        that only reads the numbers does not need it.
+        The formatting module is imported inside this method, because a program that only reads
+        the results does not need it.
         """
         from ..presentation import compose_ping
 
@@ -80,12 +79,12 @@ class PingReport(Result):
 
 
 class SessionPing:
-    """Measures once the round trip times to a session's processes, and its link delays.
+    """A single measurement of a session's round-trip times and link delays.
 
-    The caller calls `poll` repeatedly until `is_over` returns True, and then `report`. The
-    measurement does not take part in any control loop. It finds the members by their replies to
-    a query, measures the round trips to them by pings, and reads the delays of the links from
-    the statistics that the sites publish.
+    Call `poll` repeatedly until `is_over` returns True, then call `report`. The measurement
+    takes no part in any control loop. It discovers the members by sending a query, measures
+    round-trip times with pings, and reads the link delays from the statistics that the sites
+    publish.
 
     Args:
         bus: Network connection that reaches the session.
@@ -94,9 +93,9 @@ class SessionPing:
         count: Number of round trips to each member.
 
     Attributes:
-        infos: Identity of each member that has replied, by name.
-        links: Newest statistics of each site, by name.
-        pinger: Sends the pings, and estimates the offsets of the clocks.
+        infos: Identity of each member that has replied, keyed by name.
+        links: Latest statistics of each site, keyed by name.
+        pinger: Sends the pings, and estimates the clock offsets.
     """
 
     def __init__(
@@ -117,10 +116,9 @@ class SessionPing:
         self._first_ns: int | None = None
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and sends pings and queries that are due.
+        """Processes the messages that have arrived, and sends pings and queries that are due.
 
-        The caller calls this method repeatedly until enough time has passed. The method does
-        not wait.
+        The caller calls this method repeatedly until enough time has passed. It never blocks.
         """
         for info in self._members.poll():
             self.infos[info.member] = info
@@ -141,14 +139,14 @@ class SessionPing:
     def is_over(self, timeout_ns: int, begun_ns: int) -> bool:
         """Returns True once the pings to every member are complete, or have been given up.
 
-        The measurement lasts at least `GATHERING_NS` after the first reply of a member, because
-        further members may reply in this time. The measurement is given up `PATIENCE_NS` after
-        all pings should have been sent.
+        The measurement lasts at least `GATHERING_NS` after the first reply from a member, to
+        leave time for other members to reply. It is given up `PATIENCE_NS` after all pings
+        should have been sent.
 
         Args:
-            timeout_ns: Longest wait for the first reply, in ns.
-            begun_ns: Time at which the measurement was started, on the clock of this process,
-                in ns.
+            timeout_ns: Maximum time to wait for the first reply, in ns.
+            begun_ns: Time at which the measurement started, on the clock of this process, in
+                ns.
         """
         now_ns = self._clock.monotonic_ns()
         if self._first_ns is None:  # no member has replied
@@ -163,11 +161,10 @@ class SessionPing:
         return has_gathered_members and (is_complete or is_given_up)
 
     def report(self) -> PingReport:
-        """Returns the delays and clock offsets that have been measured up to the present time.
+        """Returns the delays and clock offsets measured so far.
 
-        The rows of the members (processes of the session) are sorted by name. The rows of the
-        links (one-way connections between two sites) are sorted by the name of the receiving
-        site. A value of -1 means that a delay was not measured.
+        Member rows are sorted by name, and link rows by the name of the receiving site. A value
+        of -1 means that a delay was not measured.
         """
         members = [self._describe_member(info) for _, info in sorted(self.infos.items())]
 
@@ -241,14 +238,14 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures round trip times and delays in the network of a running session once.
+    """Measures round-trip times and delays in the network of a running session once.
 
     Args:
         connection: Endpoints of the session, and keys.
         clock: Clock of this process.
         session: Name of the session.
         count: Number of round trips to each member.
-        timeout_s: Longest wait for the first reply, in s.
+        timeout_s: Maximum time to wait for the first reply, in s.
         stopped: Function that returns True to end the measurement.
 
     Returns:
@@ -259,9 +256,9 @@ def ping_session(
     """
 
     def read_site_names(text: str) -> tuple[str, ...]:
-        """Returns the names of the sites in the text of a scenario.
+        """Extracts the names of the sites from the TOML text of a scenario.
 
-        Returns an empty tuple if the scenario belongs to another version of the program.
+        Returns an empty tuple if the scenario was written for another version of the program.
         """
         try:
             return parse_embedded(text, session).names

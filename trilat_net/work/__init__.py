@@ -1,6 +1,6 @@
-"""Executes studies of many runs: worker processes, result folders, confidence intervals.
+"""Infrastructure for studies of many runs: workers, result folders, confidence intervals.
 
-A sweep, a tuning and a benchmark use this package. `executor` distributes their runs to worker
+Sweeps, tunings and benchmarks use this package. `executor` distributes their runs to worker
 processes, `study_folder` stores each finished run so that an interrupted study can continue,
 and `intervals` computes the uncertainty of the results.
 """

@@ -1,12 +1,12 @@
 """Connects to a Dask cluster, whose workers run the items of a study.
 
 Dask distributes work over several machines: a scheduler assigns items, such as simulated runs,
-to worker processes. Results can be compared only if all workers compute in exactly the same
-way. Therefore workers are checked before any item is sent. Each worker also checks itself
-before every batch of items, so that a worker that joins later meets the same requirements.
+to worker processes. Results are comparable only if all workers compute in exactly the same way.
+Workers are therefore checked before any item is sent. Each worker also checks itself before
+every batch of items, so that workers that join later meet the same requirements.
 
-A user's control law is not sent to the workers, because its hash covers only one file, which
-may import others. The worker must have the file already.
+User-written control laws are not sent to the workers, because the hash of a law covers only one
+file, which may import others. The worker must already have the file.
 
 Invariant:
     - An item runs only on a worker with the same program, the same arithmetic and the same
@@ -56,10 +56,10 @@ arithmetic, Python and packages.
 
 @cache
 def describe_worker() -> WorkerIdentity:
-    """Describes this process by everything on which its numerical results depend.
+    """Returns everything about this process that its numerical results depend on.
 
     A worker of a cluster may run items of a study only if its description equals that of the
-    process that started the study, as otherwise results could differ.
+    process that started the study, as otherwise the results could differ.
     """
     digest = hashlib.sha256()
     for root in _find_sources():
@@ -87,15 +87,15 @@ def _find_sources() -> list[Path]:
 
 
 class WorkerRequirements(NamedTuple):
-    """Requirements that make a worker of a cluster compute the same results as this machine.
+    """Conditions that a cluster worker must meet to compute the same results as this machine.
 
-    The requirements are the version of the program, equal arithmetic, and equal files of users'
+    They cover the program version, the floating-point arithmetic, and the files of user-written
     control laws.
 
     Attributes:
         identity: Properties that the worker must have.
-        laws: Pairs of an imported control law, such as "mylaws:Spring", and the SHA-256 of the
-            law's file. The worker must have this file.
+        laws: Pairs of the name of an imported control law, such as "mylaws:Spring", and the
+            SHA-256 of its file. The worker must have this file.
     """
 
     identity: WorkerIdentity
@@ -104,17 +104,17 @@ class WorkerRequirements(NamedTuple):
     def explain_unfit_worker(self, identity: WorkerIdentity, lacks: Sequence[str]) -> str:
         """Explains why a worker of a cluster may not run items of a study.
 
-        A worker must have the same source files, the same versions of packages, the same
-        floating point results, and the same files of control laws as the process that started
-        the study. Its Git commit may differ, since commits can differ in documentation only. If
-        the source files differ, the explanation also names the commits, as a hint.
+        A worker must have the same source files, package versions, floating-point results and
+        control-law files as the process that started the study. Its Git commit may differ,
+        since commits can differ in documentation only. If the source files differ, the
+        explanation also names the commits, as a hint.
 
         Args:
             identity: Versions and other properties of the worker.
             lacks: Imported control laws whose file the worker does not have.
 
         Returns:
-            The end of a sentence that begins with "the worker". Empty if the worker may run
+            The rest of a sentence that begins with "the worker". Empty if the worker may run
             items.
         """
         local = self.identity
@@ -139,7 +139,7 @@ class WorkerRequirements(NamedTuple):
         return ""
 
     def check_this_worker(self) -> None:
-        """Checks that this worker of a cluster would compute the same results as the study.
+        """Raises UsageError if this worker could compute different results.
 
         A worker that joins during the study must check itself, because the results of different
         program versions must not be mixed.
@@ -154,12 +154,13 @@ class WorkerRequirements(NamedTuple):
 
     @staticmethod
     def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-        """Finds the users' control laws whose file this process lacks or has otherwise.
+        """Returns the user-written control laws whose file is missing here or differs.
 
-        A worker without the right file could not run the study, or would compute other results.
+        A worker without the right file could not run the study, or would compute different
+        results.
 
         Args:
-            laws: Name of each law, with the SHA-256 of its file.
+            laws: Pairs of law name and SHA-256 of the law's file.
         """
         missing = []
         for code, sha256 in laws:
@@ -188,14 +189,14 @@ def _make_probe() -> Callable[
     """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
-        """Describes the worker process in which it runs, and checks its files of control laws.
+        """Describes the worker process that runs it, and checks its control-law files.
 
         Args:
-            laws: Name of each imported control law, with the SHA-256 of its file.
+            laws: Pairs of the name of an imported control law and the SHA-256 of its file.
 
         Returns:
-            The versions on which the results of this process depend; and the names of the laws
-            whose file this process does not have, or has with other contents.
+            The versions on which this process's results depend, and the names of the laws whose
+            file is missing here or has different contents.
         """
         try:
             from trilat_net.work import dask_cluster
@@ -210,8 +211,8 @@ def _make_probe() -> Callable[
 class DaskCluster:
     """Connection to the scheduler of a Dask cluster, whose workers run the items of a study.
 
-    It is a context manager that closes the connection. Items that have not finished by then are
-    cancelled.
+    Used as a context manager, which closes the connection on exit and cancels all unfinished
+    items.
 
     Args:
         address: Address of the scheduler, such as "tcp://HOST:PORT".
@@ -246,18 +247,18 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Runs functions on the workers of a Dask cluster, as a `concurrent.futures.Executor`.
+        """A `concurrent.futures.Executor` that runs functions on the cluster's workers.
 
-        A function is executed again for each call, even if the arguments are the same.
+        Every call is executed, even if an earlier call had the same arguments.
         """
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
     @property
     def workers(self) -> int:
-        """Number of items of a study that the cluster runs at the same time, one per thread.
+        """Number of items that the cluster can run at the same time, one per thread.
 
-        The number may change, because workers may join and leave.
+        The number may change as workers join and leave.
         """
         workers = self._client.scheduler_info()["workers"]
         return sum(worker["nthreads"] for worker in workers.values())
@@ -265,15 +266,16 @@ class DaskCluster:
     def require(self, laws: Sequence[tuple[str, str]]) -> WorkerRequirements:
         """Determines the requirements of a study, and checks all workers of the cluster.
 
-        A worker must have the same program, arithmetic and versions of packages as this
-        process, and the files of all imported control laws. Otherwise, results would differ.
+        A worker must run the same program version and package versions as this process, use the
+        same floating-point arithmetic, and have the files of all imported control laws.
+        Otherwise, results would differ.
 
         Args:
-            laws: Name of each imported class that the items of the study need, with the SHA-256
-                of its file.
+            laws: Pairs of the name of an imported class that the items of the study need and
+                the SHA-256 of its file.
 
         Returns:
-            The requirements, against which later workers check themselves.
+            The requirements, which workers that join later check themselves against.
 
         Raises:
             UsageError: No worker appeared within `CONNECT_S`, or a worker does not meet the
@@ -310,10 +312,10 @@ class DaskCluster:
         return required
 
     def check_alive(self) -> None:
-        """Checks that the cluster still has workers, and raises an error if it does not.
+        """Raises RunFailed if the cluster no longer has any workers.
 
-        A parameter study calls this regularly while it waits for results, because otherwise it
-        could wait forever.
+        A study calls this regularly while waiting for results, because it could otherwise wait
+        forever.
 
         Raises:
             RunFailed: The scheduler no longer responds, or had no worker for `NO_WORKER_S`.
@@ -336,11 +338,11 @@ class DaskCluster:
     def is_worker_loss(self, error: BaseException) -> bool:
         """Distinguishes the death of a worker process from an error in its item.
 
-        After the death of a worker, its items may be tried again on another worker. After an
-        error of the item, such as unmet requirements, this would be useless.
+        If a worker has died, its items can be retried on another worker. If an item has failed,
+        for example because of unmet requirements, retrying would be pointless.
 
         Args:
-            error: Error with which an item ended.
+            error: The exception with which an item ended.
 
         Returns:
             True if the workers of the item died.

@@ -1,16 +1,16 @@
 """Runs a function on many items in parallel; the worker pool of all studies.
 
-An item is a piece of work such as one simulated run. The items run in this process, in worker
-processes of this machine (by the library loky), or on a Dask cluster with the address
-"tcp://SCHEDULER:8786". Any other `concurrent.futures.Executor` can also run them. Several items
-are sent to a worker at once, as a batch, so that the overhead of the communication is small.
+An item is a unit of work such as one simulated run. Items run in this process, in worker
+processes on this machine (using loky), on a Dask cluster with an address such as
+"tcp://SCHEDULER:8786", or in any other `concurrent.futures.Executor`. To reduce communication
+overhead, several items are sent to a worker at once, as a batch.
 
 Invariant:
     - The result of an item does not depend on the worker that runs it.
     - The number of items in flight is bounded.
-    - An item whose worker died runs again, at most `MAX_LOSSES` times in all. In its last
-      attempt it is the only item that runs. Therefore the item that is named in the error
-      message is the one that kills its workers.
+    - An item whose worker died is retried, with at most `MAX_LOSSES` attempts in total. No
+      other item runs during its last attempt. Therefore the item named in the error message is
+      the one that kills its workers.
 """
 
 import itertools
@@ -68,7 +68,7 @@ _MAX_NAME = 200
 
 
 def ignore_progress(_done: int, _total: int) -> None:
-    """Ignores a report of progress. It is the default for callers that do not display any."""
+    """Does nothing. The default progress callback for callers that display no progress."""
 
 
 class _BatchResult(NamedTuple):
@@ -94,14 +94,14 @@ def run_batch(
 ) -> _BatchResult:
     """Runs a function on each item of a batch, stopping at the first error.
 
-    A worker process executes this. Several items are sent together because sending each one
-    alone would take longer than running short items.
+    Called in a worker process. Items are sent in batches because, for short items, sending each
+    one separately would take longer than running it.
 
     Args:
-        function: Function of one item that returns its result.
-        items: The items, each of which is the argument of one call.
-        required: Requirements on the worker, such as the version of the program. `None` if
-            there are no requirements.
+        function: Function that takes one item and returns its result.
+        items: The items of the batch.
+        required: Requirements on the worker, such as the program version. `None` if there are
+            no requirements.
         allowed: Imported control laws that the user allowed to run.
         together: Function that replaces `function` if the batch has several items.
 
@@ -183,11 +183,11 @@ class _Feed(Generic[T]):
     def add_timing(self, runs: int, wall_s: float) -> None:
         """Updates the mean duration of an item, which determines the size of later batches.
 
-        Short items are sent in large batches, because sending takes time as well.
+        Short items are sent in large batches, because sending also takes time.
 
         Args:
             runs: Number of finished items.
-            wall_s: Duration of all of them together, in s.
+            wall_s: Total duration of these items, in s.
         """
         self._runs = self._runs + runs
         self._wall_s = self._wall_s + wall_s
@@ -195,9 +195,9 @@ class _Feed(Generic[T]):
     def pop_batch(self, *, idle: bool) -> list[tuple[int, T]]:
         """Removes the next batch from the queue.
 
-        An item whose worker died is run again before new items, as a batch of its own. An item
-        in its last attempt is a suspect: it probably kills its worker. It runs while no other
-        batch is in flight, so that it cannot take other items with it.
+        Items whose worker died are run again before new items, each as a separate batch. An
+        item in its last attempt is a suspect, since it probably kills its worker. It runs only
+        while no other batch is in flight, so that no other items are lost with it.
 
         Otherwise the batch consists of new items. Their number is chosen from the mean duration
         of the finished items, so that the batch takes about `batch_s`.
@@ -206,7 +206,7 @@ class _Feed(Generic[T]):
             idle: True if no batch is in flight.
 
         Returns:
-            Pairs of the number of an item and the item. Empty if no item can run now.
+            Pairs of item index and item. Empty if no item can run now.
         """
         if self._suspects:
             return [self._suspects.popleft()] if idle else []
@@ -234,18 +234,18 @@ class _Feed(Generic[T]):
         return batch
 
     def return_lost(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
-        """Puts the items of a batch whose worker died back into the queue, to run them again.
+        """Puts the items of a batch whose worker died back into the queue, to be run again.
 
-        A worker may die because the operating system has run out of memory. Most of its items
-        succeed in a second attempt.
+        A worker may die because the machine has run out of memory. Most of its items then
+        succeed at the second attempt.
 
         Args:
             batch: Batch whose worker died.
-            losses: Number of losses that count for each item.
+            losses: Number of losses to count for each item.
 
         Returns:
-            The items that were lost `MAX_LOSSES` times. They are given up and do not return to
-            the queue.
+            The items that have been lost `MAX_LOSSES` times. They are given up and not returned
+            to the queue.
         """
         given_up = []
         for number, item in zip(batch.numbers, batch.items, strict=True):
@@ -263,18 +263,18 @@ class _Feed(Generic[T]):
 class WorkerPool:
     """Runs the items of a study in parallel, in processes on this machine or on a cluster.
 
-    An item is an independent piece of work, such as one simulated run. `open`
-    creates this object. A study passes its items to `map`, or to `iterate_results` if it stores
-    each result at once.
+    An item is an independent unit of work, such as one simulated run. Create a pool with
+    `open`. A study passes its items to `map`, or to `iterate_results` if it stores each result
+    immediately.
 
     Args:
         executor: Executor that runs the batches. `None` if the items run in this process.
         workers: Number of items that run at the same time.
-        restart: Function that returns a new executor after a dying worker broke the old
-            executor. `None` if the executor cannot be replaced.
+        restart: Function that returns a new executor after a dying worker broke the old one.
+            `None` if the executor cannot be replaced.
         cluster: Cluster to which the executor belongs, if any.
         required: Requirements on each worker of the cluster.
-        hint: Advice for the user that follows the message about a dead worker.
+        hint: Advice for the user, appended to the error message about a dead worker.
 
     Attributes:
         is_local: True if the items run in this process.
@@ -310,17 +310,17 @@ class WorkerPool:
     ) -> Iterator["WorkerPool"]:
         """Starts the worker processes of a study, or connects to the workers of a cluster.
 
-        The method is used in a `with` statement. Processes that it started end when the
-        statement is left. Workers of a cluster keep running.
+        Use this method in a `with` statement. On exit, the processes that it started are ended,
+        while the workers of a cluster keep running.
 
         Args:
             jobs: Number of processes on this machine. If `None`, all cores are used. If 1, the
                 items run in this process.
             on: Workers to use instead of processes on this machine.
             most: Number of items. No more processes than this are started.
-            laws: Name of each imported class that the items need, with the SHA-256 of its file.
-                Each worker must have the files.
-            hint: Advice for the user that follows the message about a dead worker.
+            laws: Pairs of the name of an imported class that the items need and the SHA-256 of
+                its file. Each worker must have the files.
+            hint: Advice for the user, appended to the error message about a dead worker.
 
         Raises:
             UsageError: The cluster cannot be reached, a worker does not meet the requirements,
@@ -357,10 +357,10 @@ class WorkerPool:
 
     @staticmethod
     def check_options(jobs: int | None, on: Workers) -> None:
-        """Rejects the options --jobs and --on together: --jobs has no effect on a cluster.
+        """Raises UsageError if the options --jobs and --on are combined.
 
-        The option --jobs sets the number of processes on this machine, and --on selects a
-        cluster.
+        The option --jobs sets the number of processes on this machine, and has no effect on a
+        cluster, which is selected with --on.
 
         Args:
             jobs: Value of --jobs. `None` if it was not given.
@@ -405,20 +405,20 @@ class WorkerPool:
     ) -> Iterator[tuple[int, R]]:
         """Runs a function on each item with all workers, and yields each result as it arrives.
 
-        An item is an independent piece of work, such as one simulated run. The results may come
-        in a different order from the items. A study can therefore store each result at once.
+        Results may arrive in a different order from the items. A study can use this method to
+        store each result immediately.
 
         Args:
-            function: Function at module level, so that another process can import it.
-            items: The items. Error messages name an item by its `str`.
+            function: Module-level function, so that other processes can import it.
+            items: The items. Error messages identify an item by its `str`.
             lost: Function that returns the result of an item that killed its workers. `None` if
                 such an item is an error.
             count: Number of items, if it is known.
             together: Function that replaces `function` for several items at once.
-            together_count: Number of items that `together` should get.
+            together_count: Number of items to pass to `together`.
 
         Yields:
-            The number of an item, counted from 0, and its result.
+            The index of an item, counted from 0, and its result.
 
         Raises:
             RunFailed: An item crashed the workers that ran it, or no workers are left.
@@ -466,14 +466,14 @@ class WorkerPool:
     ) -> list[R]:
         """Runs a function on each item of a list in parallel, and returns all results.
 
-        Items are distributed to worker processes of this machine or of a cluster.
+        The items are distributed to worker processes on this machine or on a cluster.
 
         Args:
-            function: Function at module level, so that another process can import it.
-            items: The items, each of which is the argument of one call.
+            function: Module-level function, so that other processes can import it.
+            items: The items, each passed to one call.
             progress: Function that is called each time an item is finished.
             together: Function that replaces `function` for several items at once.
-            together_count: Number of items that `together` should get.
+            together_count: Number of items to pass to `together`.
 
         Returns:
             The results in the order of the items. Empty if there are no items.

@@ -5,8 +5,8 @@ Studies print such a fraction with its Wilson interval, and a mean with its inte
 Student's t distribution.
 
 Invariant:
-    - An interval depends only on the given numbers.
-    - The interval of a mean has a positive width unless all numbers are equal.
+    - An interval depends only on the arguments.
+    - The interval of a mean has a positive width unless all values are equal.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,8 @@ import numpy as np
 def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
     """Returns the 95 % Wilson score interval of a fraction, for example of stable runs.
 
-    Unlike the normal approximation, this interval has a positive width even if all runs agree.
+    Unlike the normal approximation, this interval has a positive width even if all runs have
+    the same outcome.
 
     Source: Wilson, "Probable inference, the law of succession, and statistical inference", J.
     American Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta,
@@ -26,10 +27,10 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 
     Args:
         successes: Number of successful runs.
-        runs: Number of all runs. Without runs, the interval is (0, 1).
+        runs: Total number of runs. If 0, the interval is (0, 1).
 
     Returns:
-        The lower and the upper end.
+        The lower and upper bound.
     """
     # Imported here, because the import takes half a second.
     from scipy.stats import binomtest
@@ -44,8 +45,8 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 class MeanInterval(NamedTuple):
     """Mean of a quantity over several runs, with its 95 % confidence interval.
 
-    The interval is computed from Student's t distribution. It shows how much the mean may
-    change with other random seeds.
+    The interval is computed from Student's t distribution. It shows how much the mean might
+    differ with other random seeds.
 
     Attributes:
         mean: The mean.
@@ -60,15 +61,17 @@ class MeanInterval(NamedTuple):
 
     @classmethod
     def of_values(cls, values: Sequence[float | None]) -> "MeanInterval | None":
-        """Returns the mean of a quantity over several runs, with its 95 % interval.
+        """Computes the mean of a quantity over several runs, with its 95 % interval.
 
-        The interval says how uncertain the mean is because there are only a few runs.
+        The interval shows the uncertainty of the mean that results from the small number of
+        runs.
 
         Args:
-            values: One value per run. `None` stands for a run without a value.
+            values: One value per run. `None` for a run without a value.
 
         Returns:
-            The mean. `None` if there are fewer than two values, or if a value is missing.
+            The mean and its interval. `None` if there are fewer than two values, or if a value
+            is missing.
         """
         known = [value for value in values if value is not None]
         count = len(known)

@@ -1,9 +1,10 @@
 """Manages the folder of a study: its plan, and a journal of the finished runs.
 
 A study consists of many runs, for example a sweep over parameters. Each finished run is
-appended to the journal as a line. If the study is interrupted, it continues after the runs in
-the journal. A line is JSON, a tab, and a checksum in hexadecimal digits: the CRC-32 of the text
-that identifies the study, followed by the JSON. The journal is only appended to.
+appended to the journal as one line, so an interrupted study can continue where it stopped. A
+line consists of JSON, a tab, and a checksum in hexadecimal digits: the CRC-32 of the string
+that identifies the study, followed by the JSON. Existing lines of the journal are never
+modified.
 
 Invariant:
     - A torn line or a line of another study has a wrong checksum and is ignored.
@@ -60,11 +61,11 @@ def encode_csv(
     `None` becomes an empty field.
 
     Args:
-        rows: The rows, as values by column.
-        columns: The columns. If empty, all keys of the rows are used, in the order of their
-            first appearance.
-        header: True if the text begins with a line of column names. Of a table that is written
-            in pieces, only the first piece needs this line.
+        rows: The rows, each a mapping from column name to value.
+        columns: Column names. If empty, all keys of the rows are used, in order of first
+            appearance.
+        header: True to begin with a line of column names. When a table is written in pieces,
+            only the first piece needs this line.
     """
     stream = io.StringIO()
     all_keys = itertools.chain.from_iterable(rows)
@@ -85,15 +86,15 @@ class _JournalEntry(Protocol):
 
     @property
     def cell(self) -> Hashable:
-        """Identifier of the part of the study to which the run belongs.
+        """Identifies the part of the study to which the run belongs.
 
-        An example is the number of a grid point in a parameter sweep. The journal must show
-        which runs of a cell are finished, so that an interrupted study can continue.
+        An example is the index of a grid point in a parameter sweep. To continue an interrupted
+        study, the journal must show which runs of a cell are finished.
         """
 
     @property
     def seed(self) -> int:
-        """Seed of the run's random numbers. The runs of one cell differ by their seeds only."""
+        """Random seed of the run. The runs of one cell differ only in their seeds."""
 
 
 P = TypeVar("P")
@@ -152,18 +153,18 @@ class _StoredRuns(Mapping[tuple[Any, int], E]):
         self._file: BinaryIO | None = None
 
     def add_offset(self, key: _RunKey, offset: int) -> None:
-        """Remembers where in the file a finished run is stored.
+        """Records where in the file a finished run is stored, in bytes.
 
-        If a run occurs twice, the first one counts.
+        If a run occurs twice, the first occurrence counts.
 
         Args:
             key: Cell and seed of the run.
-            offset: Position of its line in the file, in bytes.
+            offset: Position of the run's line in the file, in bytes.
         """
         self._offsets.setdefault(key.seed, {}).setdefault(key.cell, offset)
 
     def close(self) -> None:
-        """Closes the file with the stored runs. It is opened again when a run is read."""
+        """Closes the file with the stored runs. It is reopened when a run is read."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -196,17 +197,17 @@ class _StoredRuns(Mapping[tuple[Any, int], E]):
 class RunJournal(Generic[E]):
     """A file to which a study appends the result of each run as soon as it has finished.
 
-    A sweep may take hours. If it is interrupted, it continues from this file without repeating
-    finished runs. The object is a context manager that closes the file.
+    A sweep may take hours. If it is interrupted, it can continue from this file without
+    repeating finished runs. The journal is a context manager that closes the file on exit.
 
     Args:
         path: Path of the file. Existing lines are read.
-        study: Text that identifies the study, such as the digest of its plan.
+        study: String that identifies the study, such as the digest of its plan.
         kind: Type of the entries.
-        remedy: Advice in the error message if the disk is full.
+        remedy: Advice for the error message if the disk is full.
 
     Attributes:
-        done: Finished runs, by cell and seed. Lines of another study are ignored.
+        done: Finished runs, keyed by cell and seed. Lines of other studies are ignored.
     """
 
     def __init__(self, path: Path, study: str, kind: type[E], remedy: str) -> None:
@@ -251,10 +252,10 @@ class RunJournal(Generic[E]):
         self.done.close()
 
     def add(self, entry: E) -> None:
-        """Appends the result of a finished run to the journal file at once.
+        """Writes the result of a finished run to the journal file immediately.
 
-        Thus an interruption of the study cannot lose the run. A run that the journal contains
-        already is ignored.
+        An interruption of the study then cannot lose the run. A run that is already in the
+        journal is ignored.
 
         Args:
             entry: Result of the run.
@@ -286,7 +287,7 @@ class RunJournal(Generic[E]):
         together_count: int = 1,
         note: Callable[[E], None] | None = None,
     ) -> None:
-        """Executes the unfinished runs of a study in parallel, and stores each one at its end.
+        """Executes the unfinished runs of a study in parallel, storing each one when it ends.
 
         An interrupted study therefore loses only the runs in progress.
 
@@ -294,11 +295,11 @@ class RunJournal(Generic[E]):
             pool: Workers that execute the runs.
             run: Function that executes the run of a task.
             tasks: Tasks of the pending runs, at most `total - done`.
-            done: Number of finished runs.
-            total: Number of all runs.
+            done: Number of runs finished so far.
+            total: Total number of runs.
             show: Function that is called with the number of finished runs and `total`.
             together: Function that executes the runs of several tasks at once.
-            together_count: Number of tasks that `together` should get.
+            together_count: Number of tasks to pass to `together`.
             note: Function that is called with each run after it was written.
 
         Raises:
@@ -346,15 +347,15 @@ class RunJournal(Generic[E]):
 
 
 class StudyFolder(NamedTuple, Generic[P, E]):
-    """The folder of a study, such as a sweep, with its plan, the finished runs and the results.
+    """The folder of a study, such as a sweep, with its plan, finished runs and results.
 
-    A command needs it to continue an interrupted study.
+    It contains everything that a command needs to continue an interrupted study.
 
     Attributes:
         path: Path of the folder.
         plan: Plan of the study.
         facts: Plain values that identify the study, its arithmetic and the package versions.
-        remedy: Advice in the error message if the disk is full.
+        remedy: Advice for the error message if the disk is full.
         journal: Function that opens the journal.
     """
 

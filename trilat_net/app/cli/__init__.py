@@ -1,13 +1,13 @@
-"""The `trilat` command: registers all commands, and maps errors to exit codes.
+"""The `trilat` command: registers all commands and maps errors to exit codes.
 
-The commands are functions in the files of this folder. The function `log_info_command` is the
-command `trilat log info`. Its docstring is the help of the command.
+The modules of this folder define one function per command. For example, the function
+`log_info_command` implements `trilat log info`, and its docstring is the command's help text.
 
 Invariant:
-    - A command parses its options, calls one function of the library, and prints the result.
+    - A command parses its options, calls one library function, and prints the result.
     - The exit code is 0 on success, 1 for a failed run or comparison, 2 for bad input, 4 if a
-      user's law that a log names may not run, 5 if a disk is full, and 128 + n if signal n
-      ended the command.
+      user-written law named in a log is not allowed to run, 5 if a disk is full, and 128 + n if
+      signal n ended the command.
     - An error is printed as one sentence.
 """
 
@@ -105,13 +105,13 @@ class _Group(TyperGroup):
             self.commands.setdefault(str(command.name), command)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Finds the command that the first argument names.
+        """Looks up the command named by the first argument.
 
-        Click calls this method before it runs a command. For an unknown name, for example a
-        word of another program or a typing error, the nearest command is suggested.
+        Called by Click before it runs a command. For an unknown name, such as a typing error or
+        a term used by another program, the error suggests the closest command.
 
         Raises:
-            UsageError: There is no such command. The error suggests a similar command.
+            UsageError: There is no such command.
         """
         name = args[0] if args else ""
         is_known = name.startswith("-") or self.get_command(ctx, name) is not None
@@ -139,11 +139,11 @@ class _Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
         """Parses the arguments of the command, and detects a value that the shell has split.
 
-        For example, --set dominance.m1={m2=0.1,s=0.9} without quotes becomes two arguments in
-        some shells. The general error of Click would not explain this.
+        For example, some shells split an unquoted --set dominance.m1={m2=0.1,s=0.9} into two
+        arguments. Click's generic error message would not explain this.
 
         Raises:
-            UsageError: The value of an option --set was not quoted, and the shell has split it.
+            UsageError: The value of a --set option was not quoted, and the shell has split it.
         """
         whole = _find_split_setting(args)
         if whole:
@@ -163,18 +163,19 @@ class _Commands(_Group):
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Returns the names of all commands in the order in which the help lists them.
+        """Returns the names of all commands in the order used in the help.
 
-        Commands of other packages without a place in this order come last.
+        Commands from other packages that are not listed in this order come last.
         """
         positions = {name: n for n, name in enumerate(_PANEL_OF)}
         end = len(positions)
         return sorted(super().list_commands(ctx), key=lambda name: positions.get(name, end))
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs a command, and turns Ctrl-C into a line "interrupted" and an exit code.
+        """Runs a command, and on Ctrl-C prints "interrupted" and exits with the signal's code.
 
-        The exit code is that of the signal, or 130, so that shell scripts also stop.
+        The exit code is 130 if the signal is unknown. Shell scripts that call the command
+        therefore stop too.
         """
         with Interrupt() as interrupt:
             try:
@@ -271,10 +272,11 @@ class _PackageCommand(TyperCommand):
 
     @_deferred
     def short_help(self) -> str:
-        """The first sentence of the help, which the list of all commands shows.
+        """The first sentence of the help, shown in the list of all commands.
 
-        For known packages it is in a table, because importing every package would make the help
-        slow. If the command cannot be imported, the reason is shown instead.
+        For known packages, the sentence comes from a table, because importing every package
+        would make the help slow. If the command cannot be imported, the reason is shown
+        instead.
         """
         package = find_package(COMMANDS, self._entry_name)
         if package:
@@ -286,21 +288,21 @@ class _PackageCommand(TyperCommand):
 
     @_deferred
     def help(self) -> Any:
-        """The help of the command. Reading it imports the package."""
+        """The help text of the command. Accessing it imports the package."""
         return self._command.help
 
     @_deferred
     def epilog(self) -> Any:
-        """The text below the help of the command. Reading it imports the package."""
+        """The text shown after the command's help. Accessing it imports the package."""
         return self._command.epilog
 
     @_deferred
     def params(self) -> Any:
-        """The options and arguments of the command. Reading them imports the package."""
+        """The options and arguments of the command. Accessing them imports the package."""
         return self._command.params
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
-        """Parses the arguments with the real command, which is imported from its package now.
+        """Imports the command from its package and lets it parse the arguments.
 
         Raises:
             UsageError: The package of the command is not installed or cannot be imported.
@@ -373,10 +375,10 @@ def _expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(run)
     def run_with_tuples(**arguments: Any) -> Any:
-        """Calls the function of the command, after the options have been put into their tuples.
+        """Groups the options into their named tuples and calls the function of the command.
 
         Args:
-            **arguments: Value of each option, by the name of its parameter.
+            **arguments: Option values, keyed by parameter name.
         """
         for name, option_tuple in tuples.items():
             values = [arguments.pop(field) for field in option_tuple._fields]
@@ -533,10 +535,10 @@ def _run() -> None:
 
 
 def main() -> None:
-    """Runs `trilat`, the program that users start in a terminal.
+    """Entry point of `trilat`, the program that users run in a terminal.
 
-    A known error becomes one sentence and the exit code of its class, without a traceback.
-    System errors, such as a full disk, are explained as well.
+    A known error is printed as one sentence, without a traceback, and sets the exit code of its
+    class. System errors, such as a full disk, are also explained.
     """
     TrilatError.in_command = True
     try:

@@ -1,9 +1,9 @@
 """Commands for the inputs of a run: scenarios, user-written code, measured delays, and keys.
 
-A scenario is a TOML file that describes an experiment. The code of a user may be a control law,
-an operator (a program that moves an arm) or a plant (a model of an arm). Delays that were
-measured on a network can be repeated in a simulation. Keys prove to the other processes of a
-session which process is connected.
+A scenario is a TOML file that describes an experiment. Users can write their own control laws,
+operators (programs that move an arm) and plants (models of an arm). Delays measured on a real
+network can be replayed in a simulation. With keys, each process of a session proves its
+identity to the others.
 """
 
 import shlex
@@ -67,7 +67,7 @@ def scenario_show_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
 ) -> None:
-    """Prints a scenario in full: every value of every site and link."""
+    """Prints a scenario in full, including every value of every site and link."""
     from ...scenario import list_arm_notes
 
     if name.endswith(".mcap"):
@@ -92,7 +92,7 @@ def scenario_check_command(
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks a scenario, and prints what its values imply."""
+    """Checks a scenario and prints what its values imply."""
     from ...scenario import check_outside_arms, describe_scenario
 
     scenario = options.load_chosen_scenario(file, overrides, None, None)
@@ -208,20 +208,19 @@ def trace_import_command(
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Converts delays that another program measured into a trace for links.
+    """Converts delays measured by another program into a delay trace for links.
 
     The command also prints statistics of the network.
 
     Options:
-        file: File with the JSON output of irtt, the text output of ping or fping, or a table
-            with a header.
-        out: File for the trace; default: the name of FILE with -trace.csv in place of its
-            ending, in the current folder.
-        way: Delay to use: half of a round trip (half), one direction that irtt measured (send
-            or receive), or the delay unchanged (whole). Default: half of a round trip; one-way
-            delays stay unchanged.
-        column: Column of the table that contains the delays; default: the first one with
-            a name such as delay, rtt or latency.
+        file: JSON output of irtt, text output of ping or fping, or a table with a header.
+        out: Output file for the trace; default: the name of FILE with -trace.csv in place of
+            its suffix, in the current folder.
+        way: Delay to use: half of the round trip (half), one direction as measured by irtt
+            (send or receive), or the delay unchanged (whole). Default: half of a round trip;
+            one-way delays stay unchanged.
+        column: Table column that contains the delays; default: the first one with a name such
+            as delay, rtt or latency.
     """
     from ...scenario import import_trace
 
@@ -254,11 +253,11 @@ def keys_new_command(
 ) -> None:
     """Creates keys: a certificate authority, and a folder of keys for each member.
 
-    Copy each folder to its member's machine over a channel that you trust, and name the folder
-    with --keys. Members without keys, or with keys from another authority, cannot connect; a
-    member can send only under its own name. Keep the folder `authority` on a machine where no
-    member runs: `trilat keys renew` needs this folder before the keys expire, and `trilat keys
-    add` for further members.
+    Copy each folder to its member's machine over a channel that you trust, and pass the folder
+    to commands with --keys. Members without keys, or with keys from another authority, cannot
+    connect, and each member can send only under its own name. Keep the folder `authority` on a
+    machine that runs no member. `trilat keys renew` needs this folder before the keys expire,
+    and so does `trilat keys add` to add members.
 
     Options:
         members: Members of the session: all sites, and the recorder, operator, router and
@@ -302,11 +301,12 @@ def keys_add_command(
         ),
     ] = 30,
 ) -> None:
-    """Creates keys for further members; the keys of the others stay valid.
+    """Creates keys for additional members; existing keys stay valid.
 
     The authority in the folder signs the new certificates. Copy each new folder to its member's
-    machine. Every other member needs its new file members.json, which lists all members, and a
-    restart before the next session: until then it rejects messages of the new members.
+    machine. Also copy the updated file members.json, which lists all members, to every other
+    member, and restart that member before the next session: until then it rejects messages from
+    the new members.
     """
     from ...net import MEMBERS, add_keys
 
@@ -336,11 +336,13 @@ def keys_renew_command(
     """Renews the certificates of members; their private keys stay the same.
 
     The authority in the folder signs the new certificates. Copy the files authority.pem,
-    certificate.pem and members.json from each folder to the member's machine again, and restart
-    the member before its next session: a running member keeps its old certificate.
+    certificate.pem and members.json from each folder to its member's machine again, and restart
+    the member before its next session, because a running member keeps using its old
+    certificate.
 
     Options:
-        members: Members whose certificates are renewed; default: all members with a folder.
+        members: Members whose certificates are renewed; default: all members that have a
+            folder.
     """
     from ...net import renew_keys
 
@@ -359,9 +361,9 @@ def keys_pair_command(
         ),
     ],
 ) -> None:
-    """Creates a pair of Ed25519 keys, to sign logs and to check signatures.
+    """Creates an Ed25519 key pair for signing logs and verifying signatures.
 
-    Keep NAME.key private. Give NAME.pub to everybody who checks your logs, over a channel that
+    Keep NAME.key private. Give NAME.pub to everyone who checks your logs, over a channel that
     they trust.
     """
     from ...log import create_signing_keys
@@ -381,7 +383,7 @@ def keys_info_command(
     rules: Annotated[bool, flag("--rules", "Print the Zenoh settings with all rules.")] = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows the owner of the keys, when and where they are valid, and what they permit."""
+    """Shows whose keys these are, when and where they are valid, and what they permit."""
     from ...net import ROLES, ROUTER, describe_role, read_member_keys
 
     if rules and as_json:

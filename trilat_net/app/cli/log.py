@@ -1,11 +1,11 @@
 """The commands `trilat log info`, `check`, `sign`, `recover`, `export` and `view`.
 
-A log is the MCAP file that contains the scenario of a run and all records, the results of each
-period of the arms' control loops.
+A log is an MCAP file that contains the scenario of a run and one record per site and control
+period.
 
 Invariant:
-    - No command of this file repeats the run of a log, or executes code that the log names. The
-      commands are therefore safe for logs of unknown origin.
+    - No command in this module repeats the run or executes code that a log refers to. The
+      commands are therefore safe to use on untrusted logs.
 """
 
 import shlex
@@ -27,7 +27,7 @@ _LOSSY_EXIT_CODE = 3
 
 @options.command("run.mcap", page="docs/logs/log-tools.md")
 def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
-    """Prints the contents of a log: session, sites, links and channels, and missing records."""
+    """Prints the session, sites, links and channels of a log, and any missing records."""
     from ...analysis import info
 
     with terminal.progress_bar(f"reading {files[0]}") as progress:
@@ -48,8 +48,8 @@ def log_check_command(
 ) -> None:
     """Checks that a log is well-formed, complete and consistent, without executing anything.
 
-    Exit code 0: the log is sound. 1: the log is not sound. 2: the file does not exist. For
-    files from other programs, only the structure is checked.
+    Exit code 0: the log is sound. 1: the log is not sound. 2: the file does not exist. If
+    another program wrote the file, only its structure is checked.
     """
     from ...log import check_file
 
@@ -80,8 +80,8 @@ def log_sign_command(
 ) -> None:
     """Signs a finished log with Ed25519: writes FILE.sig, and does not change FILE.
 
-    The signature covers the digest chain: all messages and everything that describes them.
-    Check it with the public key: trilat log check FILE --key PUB
+    The signature covers the digest chain, that is, all messages and their metadata. Check it
+    with the public key: trilat log check FILE --key PUB
     """
     from ...log import sign_log
 
@@ -110,8 +110,8 @@ def log_recover_command(
 ) -> None:
     """Recovers an unfinished or damaged log into a new, complete file.
 
-    The original file is not changed. The command works with every MCAP file. Exit code 0:
-    nothing was lost. 3: something was lost, and is listed. 1: nothing could be recovered.
+    The original file is not changed. The command works with any MCAP file. Exit code 0: nothing
+    was lost. 3: some data was lost, and is listed. 1: nothing could be recovered.
     """
     from ...log import recover
 
@@ -140,19 +140,19 @@ def log_export_command(
 
     Options:
         form: Format. ros2: an MCAP file of standard messages at full rate; parquet or csv: a
-            folder with a file for each site and kind of record; npz or mat: one file with an
-            array for each column; lerobot: a LeRobot dataset with an episode for each log in
-            FILE (docs/studies/lerobot.md).
+            folder with one file per site and kind of record; npz or mat: a single file with one
+            array per column; lerobot: a LeRobot dataset with one episode per log in FILE
+            (docs/studies/lerobot.md).
         settings: Setting of the format; repeatable. For lerobot: fps=30; observations=slave,
             observations=reference with the reference that the slave follows, or
-            observations=plugin for a policy that the LeRobot plugin runs, with site=m1 if the
+            observations=plugin for a policy run by the LeRobot plugin, with site=m1 if the
             plugin holds m1; environment_state=yes; actions, as --actions; task=TEXT;
-            episodes=log, or episodes=marks for the episodes that session.episode marked;
+            episodes=log, or episodes=marks for the episodes marked with session.episode;
             program=m2 if the user m2 is a program, or program=none. For ros2: names=crtk, or a
             file of names. csv, mat, npz and parquet have no settings.
-        actions: For lerobot: store the actions as the LeRobot plugin accepts them, as positions
-            of the end effectors (tip) or angles of the joints (joints). Default: the values
-            that the sites exchange.
+        actions: For lerobot: store actions in the form that the LeRobot plugin accepts, as
+            end-effector positions (tip) or joint angles (joints). Default: the values that the
+            sites exchange.
         output: File or folder to write; default: next to FILE, with a name derived from it.
     """
     from ...log import Log
@@ -219,11 +219,11 @@ def log_view_command(
     ] = None,
     force: options.ForceOption = False,
 ) -> None:
-    """Opens a log in Rerun, with a column for each site and a label for every curve.
+    """Opens a log in Rerun, with one column per site and a label on every curve.
 
-    If a log lacks the standard channels (--views off), was not finished or is split into parts,
-    a temporary file with these channels is written first. If Rerun is not installed, the page
-    of the log opens in a browser instead.
+    If a log lacks the standard channels (--views off), is unfinished or is split into parts, a
+    temporary file that has these channels is written first. If Rerun is not installed, the
+    log's page opens in a browser instead.
     """
     from importlib.util import find_spec
 

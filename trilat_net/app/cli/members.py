@@ -1,8 +1,8 @@
-"""Commands for the processes of a session, each of which can run on a machine of its own.
+"""Commands for the processes of a session, each of which can run on a separate machine.
 
-A session is a live run. Its processes are the sites (one per arm, with the control loop), the
-programs that act as operators, the recorder, and optionally a router or a bridge to ROS 2. A
-replay publishes a log as if it were a running session.
+A session is a live run. Its processes are the sites (one per arm, running the control loop),
+the programs that act as operators, the recorder, and optionally a router or a bridge to ROS 2.
+A replay publishes a log as if the session were running.
 """
 
 import math
@@ -59,17 +59,16 @@ def site_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
 ) -> None:
-    """Runs one site of a session as a process of its own.
+    """Runs one site of a session in its own process.
 
     Use it in separate terminals or on separate machines. Without endpoints, the sites of a
     session find each other on this machine: each site listens on a loopback port derived from
-    the names of the session and the site, and connects to the sites that precede it in the
-    scenario.
+    the session name and site name, and connects to the sites listed before it in the scenario.
 
     Options:
         name: Name of the site in the scenario.
         scenario: Name of a shipped scenario, or path of a TOML file.
-        stay: Longest wait at the end for the recorder to leave the session, in s.
+        stay: Longest time to wait at the end for the recorder to leave the session, in s.
         without: Begin without SITE, which may join later; repeatable. Only the first site
             accepts this option.
         leave_timeout: Longest time to continue after another site has left, if the arms then
@@ -160,14 +159,14 @@ def record_command(
 ) -> None:
     """Records a session into an MCAP log.
 
-    The recording lasts from the start of the session until its end or Ctrl-C. Without
-    endpoints, the recorder connects to the loopback port of the first site and asks for the
-    other sites. If the log is split, its parts are named FILE-001.mcap and so on. The name of a
-    file ends in .active until the file is finished.
+    Recording lasts from the start of the session until its end or Ctrl-C. Without endpoints,
+    the recorder connects to the first site's loopback port and asks it for the other sites. The
+    parts of a split log are named FILE-001.mcap and so on. A file's name ends in .active until
+    the file is finished.
 
     Options:
-        output: File of the log; default: SESSION.mcap, or runs/SESSION-N/run.mcap if --conclude
-            is used.
+        output: File of the log; default: SESSION.mcap, or runs/SESSION-N/run.mcap with
+            --conclude.
         join_timeout: Longest wait for the session to begin, in s; default: no limit.
         concluded: Verify the log at the end, and write a report into its folder.
         include: Record only these channels, for example '**/m1/**'; repeatable.
@@ -210,18 +209,19 @@ def record_command(
     clock = SystemClock.with_error(clock_offset, clock_drift)
 
     def warn_of_load() -> None:
-        """Prints a note if other programs keep the processors of this machine busy.
+        """Prints a warning if other programs are keeping this machine's processors busy.
 
-        A busy machine may record late or lose messages, but the recording goes on.
+        On a busy machine, the recorder may fall behind or lose messages, but it keeps
+        recording.
         """
         warning = check_machine_load(clock)
         if warning:
             terminal.print_note(warning)
 
     def conclude() -> None:
-        """Checks the finished log and writes its report, if the option --conclude was given.
+        """Checks the finished log and writes its report, if --conclude was given.
 
-        A log in several files is treated as one.
+        A log that is split into several files is treated as one.
         """
         if concluded:
             _conclude(list(storage.find_parts().values()), png=png)
@@ -331,12 +331,12 @@ def replay_command(
     """Publishes a log on the network with its original timing.
 
     The log appears as a separate session. To recorders, viewers and `trilat ping`, the replay
-    looks like a running session. It answers for the recorded sites, and publishes their
+    looks like a running session: it answers on behalf of the recorded sites and publishes their
     messages byte for byte. Without endpoints, the replay listens on the loopback port of the
-    first site of the replayed session.
+    replayed session's first site.
 
     Options:
-        files: File of an MCAP log, or the files of all its parts in order.
+        files: MCAP file of the log, or the files of all its parts in order.
         rate: Speed relative to the recording, or max for as fast as possible.
         start: Start of the part to play, in s after tick 0.
         duration: Duration of the part to play, in s, instead of --stop.
@@ -345,10 +345,10 @@ def replay_command(
         exclude: Leave out these channels, for example '**/link'; repeatable.
         prefix: Name the replayed session WORD-NAME, where NAME is the recorded name; '' keeps
             the recorded name.
-        time: Times at which messages are played: the times at which they were sent (publish),
-            or at which they arrived (log).
-        low_cpu: Sleep until each deadline to save processor time; the timing is then about
-            0.1 ms less exact.
+        time: Timestamps that determine when messages are played: those at which they were sent
+            (publish), or at which they arrived (log).
+        low_cpu: Sleep until each deadline to save processor time; the timing is then about 0.1
+            ms less exact.
         preload: Largest log that is held in memory, MiB; a separate process reads larger logs
             during the replay.
     """
@@ -469,10 +469,10 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
     shown_position_ns = 0
 
     def show(progress: "PlayProgress") -> None:
-        """Overwrites the line of the terminal with the present progress of playing a log.
+        """Overwrites the progress line of a replay in the terminal.
 
-        The line shows the position in the log, the speed since the last line ("x1.00" is real
-        time), the number of published messages, and their largest lateness.
+        The line shows the position in the log, the speed since the last update ("x1.00" is real
+        time), the number of messages published, and the largest delay behind schedule.
         """
         nonlocal shown_at_ns, shown_position_ns
         now_ns = clock.monotonic_ns()
@@ -647,10 +647,9 @@ def router_command(
 ) -> None:
     """Connects sites that cannot reach each other directly.
 
-    Use a router for sites behind NAT, for example. Start the sites and the recorder with
-    --router, in any order. The router runs until Ctrl-C, and a session continues after its
-    router is restarted. Routers that are connected to each other with --connect act as one
-    router.
+    A router is needed, for example, for sites behind NAT. Start the sites and the recorder with
+    --router, in any order. The router runs until Ctrl-C, and a session continues if its router
+    is restarted. Routers connected to each other with --connect act as one router.
     """
     from ...net import ROUTER, Connection
     from ..router import run_router

@@ -1,9 +1,9 @@
-"""Defines the command-line options that several commands share.
+"""Command-line options shared by several commands.
 
-They select a scenario, a network connection or a log. Options that belong together are fields
-of a named tuple. For example, the fields of `Reach` say how a command reaches a session. A
-command that has a parameter of this type accepts all of its options. The methods of the tuple
-then open the connection or read the file.
+They select a scenario, a network connection or a log. Related options are grouped as the fields
+of a named tuple. For example, the fields of `Reach` state how to connect to a session. A
+command with a parameter of such a type accepts all options of the group, and the tuple's
+methods then open the connection or read the file.
 """
 
 import inspect
@@ -33,28 +33,28 @@ Runs = TypeVar("Runs", bound=Callable[..., None])
 def check_range(
     low: float, high: float, noun: str
 ) -> Callable[[typer.CallbackParam, float | None], Any]:
-    """Returns a function that checks that the number of an option is within a range.
+    """Returns a Typer callback that checks that the value of an option is within a range.
 
-    Typer calls the function with the option, which the error message can therefore name.
+    Typer passes the option to the callback, so the error message can name the option.
 
     Args:
-        low: The smallest number.
-        high: The largest number.
-        noun: Name of the number in the error message, as in "a share".
+        low: Smallest allowed value.
+        high: Largest allowed value.
+        noun: What the error message calls the value, for example "a share".
 
     Returns:
-        A callback for `typer.Option`, which returns the number.
+        A callback for `typer.Option`, which returns the value.
     """
 
     def check(param: typer.CallbackParam, value: float | None) -> float | None:
-        """Returns the number that the user gave for an option, after checking its range.
+        """Checks that the value of an option is within the range, and returns it.
 
         Args:
             param: Declaration of the option, which contains its name.
-            value: The number. `None` if the option was not given.
+            value: Value of the option. `None` if the option was not given.
 
         Raises:
-            UsageError: The number is less than `low` or greater than `high`.
+            UsageError: The value is less than `low` or greater than `high`.
         """
         if value is not None and not low <= value <= high:
             raise UsageError(
@@ -66,34 +66,34 @@ def check_range(
 
 
 def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
-    """Declares a command-line option that takes a value, as in `--rate 100`.
+    """Declares a command-line option that takes a value, for example `--rate 100`.
 
     Args:
-        names: Names of the option, separated by spaces, as in "-o --out".
-        metavar: Placeholder of the value in the help.
-        text: Help of the option.
+        names: Names of the option, separated by spaces, for example "-o --out".
+        metavar: Placeholder for the value in the help.
+        text: Help text of the option.
         settings: Further arguments of `typer.Option`.
     """
     return typer.Option(*names.split(), metavar=metavar, help=text, **settings)
 
 
 def flag(names: str, text: str = "", **settings: Any) -> Any:
-    """Declares a command-line option that is on or off, as in `--json`.
+    """Declares a command-line option that is either on or off, for example `--json`.
 
     Args:
-        names: Names of the option, as in "--json" or "--ports/--no-ports".
-        text: Help of the option.
+        names: Names of the option, for example "--json" or "--ports/--no-ports".
+        text: Help text of the option.
         settings: Further arguments of `typer.Option`.
     """
     return typer.Option(names, help=text, **settings)
 
 
 def seconds(name: str, text: str = "") -> Any:
-    """Declares a command-line option with a time to wait, from 0 s to one day.
+    """Declares a command-line option for a waiting time between 0 s and one day.
 
     Args:
         name: Name of the option, such as "--timeout".
-        text: Help of the option.
+        text: Help text of the option.
     """
     return value(name, "S", text, callback=check_range(0.0, 86_400.0, "a number of seconds"))
 
@@ -105,26 +105,26 @@ _OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
 def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], Runs]:
     """Returns a decorator that declares a function as a command of the program.
 
-    The docstring of the function is the help of the command. Its section `Options` has the help
-    of those options for which the declaration has no room.
+    The function's docstring becomes the command's help text. Its `Options` section holds the
+    help texts of options that are too long to write in their declarations.
 
     Args:
-        examples: Arguments of the examples that the help shows.
-        page: Page of the documentation that the help names, as in "docs/reference/links.md".
+        examples: Arguments of the example invocations shown in the help.
+        page: Documentation page that the help refers to, for example "docs/reference/links.md".
     """
 
     def declare(run: Runs) -> Runs:
-        """Stores the help of a command where Typer, the command line library, expects it.
+        """Moves the help texts in a command's docstring to where Typer expects them.
 
-        The entries in the section `Options` of the docstring become the help texts of the
-        options. The rest of the docstring is the help of the command.
+        The entries in the docstring's `Options` section become the help texts of the options.
+        The rest of the docstring becomes the help text of the command.
 
         Args:
             run: Function that executes the command.
 
         Returns:
-            The same function, with the examples and the page in its attributes `examples`
-            and `page`.
+            The same function, with the examples and the page in its attributes `examples` and
+            `page`.
         """
         run.examples = examples  # type: ignore[attr-defined]
         run.page = page  # type: ignore[attr-defined]
@@ -148,20 +148,20 @@ _NO_LAWS = ("conditions", "interface", "sent_vectors")
 def list_laws() -> list[str]:
     """Lists the names of the built-in control laws, for help texts and error messages.
 
-    The names are taken from the file names, because importing all modules would take long.
+    The names are derived from the file names, because importing all modules would be slow.
     """
     folder = str(Path(__file__).parents[2] / "laws")
     return [module.name for module in iter_modules([folder]) if module.name not in _NO_LAWS]
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Lists the scenarios that the shell offers when the user presses the tab key.
+    """Lists scenarios for tab completion in the shell.
 
-    They are the shipped scenarios, and the TOML files of a folder.
+    The candidates are the shipped scenarios and the TOML files in a folder.
 
     Args:
-        incomplete: The word so far. If it has a slash, files of its folder are listed,
-            otherwise files of the current folder.
+        incomplete: The word typed so far. If it contains a slash, files in that folder are
+            listed, otherwise files in the current folder.
     """
     candidates = []
     for entry in _SCENARIOS.iterdir():
@@ -177,12 +177,10 @@ def complete_scenarios(incomplete: str) -> list[str]:
 
 
 def complete_figures(incomplete: str) -> list[str]:
-    """Lists the names of figures that begin with the letters that the user has typed.
-
-    The shell offers these names when the user presses the tab key.
+    """Lists figure names for tab completion in the shell.
 
     Args:
-        incomplete: The letters before the completion.
+        incomplete: The word typed so far.
     """
     from ...presentation import FIGURES
 
@@ -190,11 +188,11 @@ def complete_figures(incomplete: str) -> list[str]:
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Lists the names of arms that the shell offers when the user presses the tab key.
+    """Lists site names for tab completion in the shell.
 
     Args:
-        context: The command line, whose scenario or log names the sites.
-        incomplete: The word so far.
+        context: The parsed command line, whose scenario or log defines the sites.
+        incomplete: The word typed so far.
 
     Returns:
         The names. Empty if the command line has no valid scenario or log yet.
@@ -287,13 +285,12 @@ MOST_LETTERS = 80
 
 
 def check_session_name(name: str) -> str:
-    """Checks that the name of a session can be part of a network address, and returns it.
+    """Returns a session name after checking that it is a valid part of a Zenoh key.
 
-    Zenoh, the network library, calls such an address a key, in which some characters are not
-    allowed.
+    A Zenoh key is a network address, in which some characters are not allowed.
 
     Raises:
-        UsageError: The name is too long or has other characters.
+        UsageError: The name is too long or contains other characters.
     """
     has_valid_characters = re.fullmatch("[A-Za-z0-9_.-]+", name)
     if len(name) > MOST_LETTERS or not has_valid_characters:
@@ -403,16 +400,17 @@ AllOption = Annotated[
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:
-    """Rejects the path of a figure that cannot be written, before the figure is computed.
+    """Raises UsageError if a figure cannot be written to a path.
 
-    The computation may take long, and would be lost.
+    Called before the figure is computed, so that a long computation is not wasted.
 
     Args:
         path: Path of the figure. `None` if no figure was requested.
         force: True to replace an existing file.
 
     Raises:
-        UsageError: The format is unknown, the file exists, or its folder does not.
+        UsageError: The format is unknown, the file already exists, or its folder does not
+            exist.
     """
     if path is None:
         return
@@ -433,16 +431,17 @@ def check_picture(path: Path | None, *, force: bool) -> None:
 def print_and_draw(
     result: "Result", picture: Path | None, figure: str, drawn: Any, *, as_json: bool
 ) -> None:
-    """Prints a result, and writes a figure of it if a path is given.
+    """Prints a result, and also draws it to a file if a path is given.
 
-    The module that draws is imported only if a figure is requested, because Matplotlib is slow
-    to import.
+    The drawing module is imported only if a figure is requested, because Matplotlib is slow to
+    import.
 
     Args:
         result: The result.
         picture: Path of the figure. `None` if no figure was requested.
-        figure: Module and function that draw the figure, as in "twin_differences:draw_twins".
-        drawn: Argument of that function.
+        figure: Module and function that draw the figure, for example
+            "twin_differences:draw_twins".
+        drawn: Argument passed to that function.
         as_json: True to print the result as JSON.
     """
     if picture is not None:
@@ -461,12 +460,12 @@ def print_and_draw(
 def load_chosen_scenario(
     source: str, overrides: list[str] | None, duration: float | None, seed: int | None
 ) -> "Scenario":
-    """Loads the scenario that a command names, with the changes that its options request.
+    """Loads the scenario named on the command line, with the overrides given as options.
 
     Args:
         source: Name of a shipped scenario, or path of a TOML file.
         overrides: Overrides from --set.
-        duration: Duration in s from --duration. If `None`, the scenario's duration is kept.
+        duration: Duration from --duration, in s. If `None`, the scenario's duration is kept.
         seed: Seed from --seed. If `None`, the scenario's seed is kept.
     """
     from ...scenario import load_scenario
@@ -507,13 +506,15 @@ def _find_key(override: str) -> str:
 
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
-    """Returns the changes to a scenario that the options --set and --duration request.
+    """Returns the scenario overrides requested by the options --set and --duration.
 
-    With these options a user can change an experiment for one run without editing its file.
+    With these options, a user can change an experiment for one run without editing its file.
 
     Args:
-        overrides: Texts of --set, such as "links.delay_ms=5". `None` if the option is absent.
-        duration: Value of --duration, in s. It becomes "duration_s=10.0". `None` if absent.
+        overrides: Arguments of --set, such as "links.delay_ms=5". `None` if the option is
+            absent.
+        duration: Value of --duration, in s. 10 s becomes "duration_s=10.0". `None` if the
+            option is absent.
 
     Raises:
         UsageError: Both options set the duration.
@@ -526,18 +527,18 @@ def list_overrides(overrides: list[str] | None, duration: float | None) -> list[
 
 
 def split_names(text: str | None) -> list[str]:
-    """Splits the names that a user gave in one option: "adaptive, p_d" gives two names.
+    """Splits a comma-separated option value, such as "adaptive, p_d", into a list of names.
 
-    `None`, which stands for an absent option, gives an empty list.
+    Returns an empty list for `None`, that is, if the option is absent.
     """
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
 def list_used_options(context: typer.Context) -> list[str]:
-    """Lists the options that the user wrote on the command line, without those at defaults.
+    """Lists the options given on the command line, excluding those left at their defaults.
 
-    Commands use the list to reject combinations of options. An option that has its default
-    value does not conflict with others.
+    Commands use the list to reject incompatible combinations of options. An option at its
+    default value does not conflict with any other.
 
     Returns:
         The first name of each option, for example "--seed", in the order of declaration.
@@ -551,10 +552,10 @@ def list_used_options(context: typer.Context) -> list[str]:
 
 
 class MemberOptions(NamedTuple):
-    """Options with which a process connects to the other processes of a session.
+    """Options that control how a process connects to the other processes of a session.
 
-    The options say at which network endpoints the process listens, to which it connects, and
-    with which keys.
+    They specify the network endpoints to listen on, the endpoints to connect to, and the keys
+    to use.
     """
 
     listen: ListenOption = None
@@ -567,14 +568,13 @@ class MemberOptions(NamedTuple):
     def find_endpoints(
         self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
     ) -> "Connection":
-        """Returns the network addresses that the options state, without encryption keys.
+        """Returns the network endpoints given by the options, without loading any keys.
 
-        The network library Zenoh connects processes by such addresses, for example
-        "tcp/192.168.0.5:7447".
+        An endpoint is an address in Zenoh's notation, for example "tcp/192.168.0.5:7447".
 
         Args:
-            listen_else: Addresses at which to listen if the options state no address.
-            connect_else: Addresses to which to connect if the options state no address.
+            listen_else: Endpoints to listen on if the options give none.
+            connect_else: Endpoints to connect to if the options give none.
         """
         from ...net import Connection
 
@@ -594,14 +594,14 @@ class MemberOptions(NamedTuple):
         *,
         stops: bool = False,
     ) -> "Connection":
-        """Returns the network connection that the options of a command describe, with its keys.
+        """Returns the network connection specified by the options, including its keys.
 
-        A note for the user is printed if the keys expire soon.
+        If the keys expire soon, a note is printed for the user.
 
         Args:
-            listen_else: Endpoints at which to listen if the options name no endpoint.
-            connect_else: Endpoints to which to connect if the options name no endpoint.
-            stops: True if the connection only serves to stop arms. Expired keys are then
+            listen_else: Endpoints to listen on if the options give none.
+            connect_else: Endpoints to connect to if the options give none.
+            stops: True if the connection is used only to stop arms. Expired keys are then
                 accepted, and no note is printed.
         """
         connection = self.find_endpoints(listen_else, connect_else)
@@ -619,10 +619,10 @@ class MemberOptions(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """The options with which a command connects to a running session from outside.
+    """Options that control how a command connects to a running session from outside.
 
-    The command only observes or changes the session. It is not one of its sites or recorders,
-    and therefore does not listen for connections.
+    The command only observes or modifies the session. Since it is not one of the session's
+    sites or recorders, it does not listen for connections.
     """
 
     connect: ConnectOption = None
@@ -631,14 +631,14 @@ class Reach(NamedTuple):
     keys: KeysOption = None
 
     def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
-        """Returns the connection to a running session that the command-line options describe.
+        """Returns the connection to a running session specified by the options.
 
-        If the session is encrypted, the option --keys names the keys of the command.
+        For an encrypted session, the option --keys selects the keys of the command.
 
         Args:
-            operates: True if only the keys of the operator permit the command's requests. Other
-                keys are then rejected.
-            stops: True if the command only stops arms. Then expired keys are accepted too.
+            operates: True if the command's requests require the operator's keys. Other keys are
+                then rejected.
+            stops: True if the command only stops arms. Expired keys are then also accepted.
         """
         from ...net import OPERATOR
 
@@ -647,10 +647,10 @@ class Reach(NamedTuple):
 
 
 class LawFileOptions(NamedTuple):
-    """Options that permit a log's control laws, written by a user, to be executed.
+    """Options that permit user-written control laws named in a log to be executed.
 
-    A log may come from somebody else. Code that it names runs only with the permission of the
-    user.
+    Since a log may come from someone else, code that it names runs only with the user's
+    permission.
     """
 
     law: Annotated[
@@ -678,14 +678,14 @@ class LawFileOptions(NamedTuple):
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
-        """Opens a log, and warns the user if code of another person will be executed.
+        """Opens a log, and warns the user if another person's code will be executed.
 
         A log may name files with control laws, which are executed if the run is repeated.
 
         Args:
-            *files: The log, or the files into which it is divided.
-            runs_them: True if the command executes the control laws that the log names. Only
-                then the user is warned.
+            *files: The log, or the files into which it is split.
+            runs_them: True if the command executes the control laws named in the log. If False,
+                no warning is given.
         """
         allowed: dict[str, Any] = {**self._asdict(), "law": self.law or ()}
         log = terminal.open_with_progress(*files, **allowed)
@@ -697,8 +697,8 @@ class LawFileOptions(NamedTuple):
 class RunOptions(NamedTuple):
     """Options of a command that runs a session on this machine and reports on it.
 
-    The options override parts of the scenario (`load`), name the folder of the results, and
-    select the files and lines to write.
+    They override parts of the scenario (see `load`), set the results folder, and select what is
+    written to files and to the terminal.
     """
 
     duration: DurationOption = None
@@ -712,7 +712,7 @@ class RunOptions(NamedTuple):
     as_json: JsonOption = False
 
     def load(self, source: str, longest_s: float | None = None) -> "Scenario":
-        """Loads the scenario of the run, with the changes that the command's options request.
+        """Loads the scenario of the run, with the overrides given as options.
 
         Args:
             source: Name of a shipped scenario, or path of a TOML file.
@@ -729,18 +729,18 @@ class RunOptions(NamedTuple):
 
 
 def parse_viz_rate(text: str) -> float:
-    """Parses the option `--views`: how many messages per second viewers such as Foxglove get.
+    """Parses the option `--views`, the rate of messages for viewers such as Foxglove, in Hz.
 
-    Fewer messages make the log smaller.
+    A lower rate makes the log smaller.
 
     Args:
         text: A number from 1 to 1e6, "off" or "full".
 
     Returns:
-        The rate in Hz. It is 0 for "off" and `FULL_RATE_HZ` for "full".
+        The rate in Hz. 0 for "off", and `FULL_RATE_HZ` for "full".
 
     Raises:
-        UsageError: The text is neither a number in range nor one of these words.
+        UsageError: The argument is neither a number in this range nor one of these words.
     """
     keywords = {"off": 0.0, "full": FULL_RATE_HZ}
     if text in keywords:

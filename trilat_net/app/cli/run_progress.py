@@ -1,8 +1,8 @@
-"""Shows the progress of commands with many runs.
+"""Progress display for commands that execute many runs.
 
-A sweep or a tuning may take hours. `show_progress` shows a bar in a terminal. In a file or a
-pipe it prints at most ten lines with the remaining time. If the total number of items grows, as
-in a sweep that is refined, it prints up to ten more lines.
+A sweep or a tuning may take hours. In a terminal, `show_progress` displays a progress bar. When
+the output goes to a file or a pipe, it prints at most ten lines with the remaining time
+instead, and up to ten more if the total number of items grows, as in a sweep that is refined.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,15 +22,15 @@ def show_progress(
 ) -> Iterator[Callable[[int, int], None]]:
     """Shows the progress of a long computation as a bar in a terminal.
 
-    Elsewhere, for example in a log file, a few lines are printed instead.
+    If the output is not a terminal (a log file, for example), a few lines are printed instead.
 
     Args:
         label: Label of the bar.
         print_line: Function that prints a line.
-        items: Noun of the counted items, in the plural.
+        items: What is being counted, as a plural noun.
 
     Yields:
-        A function to call with the number of finished items and of all items.
+        A function to call with the number of finished items and the total number of items.
     """
     if terminal.err.is_interactive:
         with terminal.progress_bar(label) as show:
@@ -46,13 +46,13 @@ def show_progress(
     def show_line(done: int, total: int) -> None:
         """Prints a line with the remaining time, about once per tenth of the items.
 
-        The remaining time is estimated from the mean duration of the items since the first
-        call. No line is printed at the first call, where this duration is unknown, nor after
-        the last item.
+        The remaining time is estimated from the mean duration per item since the first call.
+        The first call prints no line because this duration is not known yet, and no line is
+        printed after the last item.
 
         Args:
             done: Number of finished items.
-            total: Number of all items.
+            total: Total number of items.
         """
         nonlocal first_call_ns, done_at_first_call, printed_tenths, last_total
         if first_call_ns < 0:

@@ -1,8 +1,9 @@
 """Commands that run a scenario in virtual time, and commands that evaluate the log of a run.
 
 A scenario describes an experiment: the arms, their control laws, the network and the people who
-move the arms. In virtual time, the program computes the run as fast as it can, with simulated
-arms and delays and without a network. The log is the MCAP file with all results of the run.
+move the arms. In virtual time, the run is simulated as fast as possible, with simulated arms
+and delays and without a real network. The log is an MCAP file that contains everything recorded
+during the run.
 """
 
 import shlex
@@ -43,7 +44,7 @@ def sim_command(
 ) -> None:
     """Runs a scenario in virtual time, without a network.
 
-    It writes the same kind of log as a live session.
+    The result is the same kind of log that a live session writes.
     """
     from ...execution import record_virtual
     from .options import parse_viz_rate
@@ -136,19 +137,19 @@ def verify_command(
 ) -> None:
     """Executes a log again, and compares every computed number.
 
-    Every site is executed again from its records, and every computed field is compared. A
-    record is the stored result of a site in one control period. The numbers must agree bit for
-    bit.
+    Every site is executed again from its records (one record holds everything that a site
+    received and computed in one control period), and every computed field is compared. The
+    numbers must agree bit for bit.
 
     Exit code 0: everything agrees, the log was not changed, and enough of every site was
-    checked. 1: something differs, was changed, or is missing. 2: there is no log. 4: the
-    control law of a site is external code that needs --law to run; everything else agrees.
+    checked. 1: something differs, was changed, or is missing. 2: there is no log. 4: a site's
+    control law is external code that needs --law to run; everything else agrees.
 
     Options:
         virtual: Also compare the log with two runs in virtual time: one with the recorded
             arrival times of messages, and one over a network that adds no delay.
         resume_every: Restart each site from its records every N ticks (control periods), to
-            reveal state of a control law that the records lack; default 0: never.
+            reveal control-law state that is missing from the records; default 0: never.
     """
     from ...execution import LogCheckReport
 
@@ -212,20 +213,20 @@ def certify_command(
     laws: options.LawFileOptions,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Judges whether a run was stable, and says why.
+    """Judges whether a run was stable, and explains why.
 
-    The verdict is stable, settled, not stable or open. The command prints it with its most
-    important reasons: the energy function V of the stability proof, its energy balance, and the
-    roots of the linearised loop at the final pose. With --all it also prints the conditions of
-    the proof (premises) and the energies. It executes the run again together with twins, which
-    are repetitions with a small push. The code of imported control laws runs only with --law,
-    or with --own-laws if it was remembered. docs/logs/certificate.md explains the verdicts and
-    leads to every term and key.
+    The verdict is stable, settled, not stable or open. It is printed with its most important
+    reasons: the energy function V of the stability proof, its energy balance, and the roots of
+    the linearised loop at the final pose. With --all, the conditions of the proof (premises)
+    and the energies are also printed. The command executes the run again, along with twins,
+    which are repetitions with a small push. The code of imported control laws runs only with
+    --law, or with --own-laws if it was remembered. docs/logs/certificate.md explains the
+    verdicts and links to every term and key.
 
     Stable: a proof exists for this loop. Settled: the run came to rest (speeds at most 0.01
-    rad/s) or was decaying, and every push died away, but nothing proves more. Exit code 0:
-    stable. 1: settled, not stable (bounded oscillation, drifting, growing, diverged) or open.
-    2: there is no log, or no site has a record in it.
+    rad/s) or was decaying, and every push died away, but nothing further is proved. Exit code
+    0: stable. 1: settled, not stable (bounded oscillation, drifting, growing, diverged) or
+    open. 2: there is no log, or it contains no records of any site.
     """
     from ...analysis import certify_run
     from ...presentation import compose_citation
@@ -284,10 +285,10 @@ def twin_command(
 ) -> None:
     """Repeats a run with a small push: does the push die away?
 
-    A repetition with a push is called a twin. Each twin uses the recorded arrivals of messages,
-    delays, hands and changes of the run. The difference from the run is simulated in full,
-    without a linear model (docs/logs/twins.md). The exit code is 0 whether or not the
-    disturbances grow.
+    A repetition with a push is called a twin. Each twin uses the message arrivals, delays, hand
+    motions and setting changes recorded in the run. The difference from the original run is
+    simulated in full, without linearisation (docs/logs/twins.md). The exit code is 0 whether or
+    not the disturbances grow.
     """
     from ...analysis import twin
 
@@ -310,8 +311,8 @@ def metrics_command(
 
     The ten most important numbers are printed, each with the site, link or wall that has the
     largest value. With --all, tables cover tracking, effort, energies, force sharing,
-    impedance, walls, learning and the network, with a column for each site, link and wall. A
-    dash marks a missing value; if the run could have the value, the reason is given.
+    impedance, walls, learning and the network, with one column per site, link and wall. A dash
+    marks a missing value, with the reason if the metric applies to the run.
     docs/reference/metrics.md has every formula.
     """
     from ...analysis import LogMetrics
@@ -342,13 +343,13 @@ def figure_command(
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Draws figures of a log for a paper, as PDF, PNG or SVG.
+    """Draws publication figures of a log, as PDF, PNG or SVG.
 
-    Text in the figures is 8 pt high. The same log always gives the same bytes.
+    Text in the figures is 8 pt high. The same log always produces the same bytes.
 
     Options:
         names: Names of the figures (see --list); default: all figures for which FILE has data.
-        width_in: Width of the figures in inches: one or two columns of a paper.
+        width_in: Width of the figures in inches, for one or two columns of a paper.
         folder: Folder for the figures; default: the name of FILE with -figures in place of
             .mcap.
         others: Draw this log together with FILE in the same panels; repeatable. Works for the
@@ -442,7 +443,7 @@ def report_command(
 ) -> None:
     """Writes a web page about a log: arms, charts and verdict.
 
-    A summary is written beside the page, and with --png also the figures.
+    A summary is written next to the page, along with the figures if --png is given.
     """
     from ...files import make_results_folder, refuse_link
     from ...presentation import conclude
@@ -487,10 +488,10 @@ def rerun_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Computes what a run would have been with other settings.
+    """Computes how a run would have gone with other settings.
 
-    The results are compared with those of the log. Without --closed-loop, only the sites that
-    --replace names are executed again. The other sites repeat what was recorded, and do not
+    The results are compared with the log. Without --closed-loop, only the sites named by
+    --replace are executed again. All other sites repeat their recorded behaviour and do not
     react.
     """
     from ...execution import rerun
@@ -575,9 +576,9 @@ def linear_command(
 
     The loop is linearised about its equilibrium. The command computes the characteristic roots,
     the largest delay for which the loop is stable, and the stability limits along scenario keys
-    (edges of stability, docs/studies/linear.md). For the arms without operators and
-    environments, it computes passivity, Llewellyn's criterion of absolute stability, and the
-    impedances that operators feel (docs/studies/ports.md). The exit code is 0 for every
+    (edges of stability, docs/studies/linear.md). For the arms alone, without operators and
+    environments, it also computes passivity, Llewellyn's criterion of absolute stability, and
+    the impedances that operators feel (docs/studies/ports.md). The exit code is 0 for every
     verdict.
     """
     options.check_picture(picture, force=force)

@@ -1,8 +1,8 @@
 """Commands that start, show, measure, change or stop a session, or check this machine.
 
-A session is a live run. Several processes ("sites"), possibly on different machines, each
-control one robot arm and exchange the states of the arms over a network. The commands reach the
-sites over the same network.
+A session is a live run of several processes, possibly on different machines. Each of these
+processes (sites) controls one robot arm and exchanges its state with the others over a network.
+The commands reach the sites over the same network.
 """
 
 import re
@@ -33,7 +33,7 @@ def demo_command(
 ) -> None:
     """Runs a scenario live, verifies its log and writes a report.
 
-    Each site runs in its own process, and so does the recorder; they communicate over Zenoh.
+    Each site and the recorder run in separate processes that communicate over Zenoh.
     """
     run_and_report(run.load(scenario), run)
 
@@ -48,13 +48,13 @@ class _SessionPage(Protocol):
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> AbstractContextManager[Callable[[], bool]]:
-        """Shows the session while it runs. `SessionAttendant` explains arguments and result."""
+        """Shows the session while it runs; see `SessionAttendant` for arguments and result."""
 
     def offer_results(self, paths: Iterable[Path]) -> None:
-        """Adds links to the session's web page, for downloading the report and the log.
+        """Adds links for downloading the report and the log to the session's web page.
 
         Args:
-            paths: Files that the run has written.
+            paths: Files written by the run.
         """
 
 
@@ -88,8 +88,8 @@ def run_and_report(
     Args:
         chosen: The scenario.
         run: The options of the run.
-        page: Page in a browser that shows the session, has a button that ends it, and links to
-            the report. `None` if there is no page.
+        page: Browser page that shows the session, offers a button to end it, and links to the
+            report. `None` if there is no page.
 
     Raises:
         typer.Exit: The session was interrupted or had problems, or the log failed a check.
@@ -168,28 +168,29 @@ def ping_command(
     """Measures delay and clock offset to each member of a session.
 
     The command shows the round-trip time, the clock offset and the jitter between this machine
-    and every member. The session may still be waiting for members. If it is running, the delays
-    that its sites measure on their links are shown too. Without endpoints, the command connects
-    to the loopback port of the first site and asks for the other sites.
+    and every member. It also works while the session is still waiting for members. Once the
+    session is running, the delays that its sites measure on their links are also shown. Without
+    endpoints, the command connects to the first site's loopback port and asks it for the other
+    sites.
 
-    With --benchmark no session is needed: the command measures whether the network is good
-    enough for a scenario, using the delay margin that `trilat linear` computes. To measure the
-    network to another machine, run `trilat ping --answer EP` there, and use --connect EP here.
-    Without --connect, both ends run on this machine, over TCP, TLS and QUIC, and no network is
-    measured. The benchmark takes half a minute. The exit code is 1 if the network is not good
-    enough.
+    With --benchmark, no session is needed: the command measures whether the network is good
+    enough for a scenario, using the delay margin computed by `trilat linear`. To measure the
+    network to another machine, run `trilat ping --answer EP` on that machine, and use --connect
+    EP here. Without --connect, both ends run on this machine, over TCP, TLS and QUIC, and no
+    network is measured. The benchmark takes half a minute. The exit code is 1 if the network is
+    not good enough.
 
-    With --ros2 no session is needed either: the command listens over Zenoh to a ROS 2 topic of
+    With --ros2, no session is needed either: the command listens over Zenoh to a ROS 2 topic of
     any message type (docs/sessions/ros2.md).
 
     Options:
         benchmark: Instead, measure whether the network to --connect EP is good enough for this
             scenario, for several message sizes, rates and transports. Without --connect,
             measure this machine alone.
-        ros2: Measure the delay of messages of this ROS 2 topic instead.
+        ros2: Measure the delay of messages on this ROS 2 topic instead.
         seconds: Total duration of the benchmark, in s; default: 24. With --ros2: duration of
-            the measurement, in s; default: 5. With --answer: time after which the command
-            ends, in s; default: no limit.
+            the measurement, in s; default: 5. With --answer: time after which the command ends,
+            in s; default: no limit.
         picture: File for a figure of the benchmark (.png, .svg or .pdf).
         answer: Answer benchmarks from other machines on this endpoint; repeatable.
     """
@@ -423,10 +424,11 @@ def stop_command(
 ) -> None:
     """Stops arms at once; the session goes on.
 
-    The arms come to rest where they are, and stay there until you run `trilat enable`.
-    With --end, all sites end their run at the same time instead. Without endpoints, the command
+    The arms come to rest where they are, and stay there until you run `trilat enable`. With
+    --end, all sites end their run at the same time instead. Without endpoints, the command
     reaches the sites on this machine at the addresses that they have stored in files. If there
-    are none, it connects to the loopback port of the first site and asks for the other sites.
+    are no such files, it connects to the first site's loopback port and asks it for the other
+    sites.
     """
     if end and sites:
         raise UsageError("--end ends the whole session: do not name a site")
@@ -455,10 +457,10 @@ def reset_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Clears the faults of sites if the causes have been removed.
+    """Clears the faults of sites whose causes have been removed.
 
-    The sites then wait for the other sites. Each arm aligns with the other arms before it
-    follows them.
+    The sites then wait for the other sites. Each arm aligns with the other arms before
+    following them.
     """
     terminal.print_texts(_connect(session, reach).reset(*sites))
 
@@ -550,7 +552,8 @@ def set_command(
 ) -> None:
     """Changes a link, or who leads, while a session runs.
 
-    Without endpoints, it asks the first site, on its loopback port, for the other sites.
+    Without endpoints, the command connects to the first site's loopback port and asks it for
+    the other sites.
     """
     name = None if session is None else options.check_session_name(session)
     # Typer runs this function first, and then the command of the group, which needs both.
@@ -581,7 +584,7 @@ def set_link_command(
         ),
     ] = None,
 ) -> None:
-    """Changes keys of a directed link; a model or a preset replaces all keys."""
+    """Changes settings of a directed link; a model or a preset replaces all of them."""
     table = _parse_pairs(to or [], "deviation_ms=20")
     if preset is not None:
         table["preset"] = preset
@@ -671,7 +674,7 @@ def doctor_command(
 ) -> None:
     """Checks whether this machine is ready for a live session.
 
-    It checks keys, endpoints, clocks, real-time privileges, disk and processors. Use the
+    The checks cover keys, endpoints, clocks, real-time privileges, disk and processors. Use the
     options of the site, recorder or router that will run on this machine. The exit code is 1 if
     a check fails.
     """

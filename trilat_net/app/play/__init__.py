@@ -1,6 +1,6 @@
-"""Plays a log: publishes its messages on the network again, at their original times.
+"""Plays a log: publishes its messages on the network again, with their original timing.
 
-Recorders and viewers can thus be tested, and a session can be shown, without the arms.
-`play_process` is the process that plays, `session_reader` reads the log, and `player` keeps the
-times.
+This allows recorders and viewers to be tested, and a session to be shown, without the arms. The
+playback process is in `play_process`, `session_reader` reads the log, and `player` controls the
+timing.
 """

@@ -1,14 +1,13 @@
 """Sorts the messages of a log into playback order, and stores them compactly.
 
-A recorder writes messages as they arrive. A message that it missed at first therefore comes
-late in the file. Played messages must be in order. A `BatchBuilder` collects messages in the
-order of a file and sorts them into a `MessageBatch`, a table of numbers with a buffer of bytes.
-A minute of 9000 messages/s takes about 100 MiB in this form, a third of its size as Python
-objects.
+A recorder writes messages as they arrive, so a message that it missed at first appears late in
+the file. Playback, however, must be in order. A `BatchBuilder` collects messages in file order
+and sorts them into a `MessageBatch`, which consists of an integer table and a byte buffer. In
+this form, a minute of 9000 messages/s takes about 100 MiB, a third of the size of the same
+messages as Python objects.
 
 Invariant:
-    - Messages are played in the order of their times, and within a channel in the order of
-      their numbers.
+    - Messages are played in order of time, and within a channel in order of their numbers.
     - A message that a site has sent again is played no later than the next message of its
       channel.
     - Messages with the same time keep the order of the file.
@@ -48,21 +47,21 @@ _COLUMNS = 5
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
-    """Computes the order in which recorded messages are played, and the deadline of each.
+    """Computes the playback order of recorded messages, and the deadline of each, in ns.
 
-    Messages are played in the order of their times. Within a channel they are also played in
-    the order of their numbers, even if a message was recorded late.
+    Messages are played in order of time. Within a channel they are also played in order of
+    their numbers, even if a message was recorded late.
 
     Args:
-        times_ns: Sending or arrival time of each of K messages in the order of the file, shape
-            (K,), in ns.
-        channels: Number of the channel of each message, shape (K,).
-        numbers: Number of each message in its channel, shape (K,). Messages with equal numbers
-            stay in the order of the file.
+        times_ns: Sending or arrival time of each of K messages in file order, shape (K,), in
+            ns.
+        channels: Channel index of each message, shape (K,).
+        numbers: Number of each message within its channel, shape (K,). Messages with equal
+            numbers stay in file order.
 
     Returns:
-        The indices of the messages in play order, shape (K,), and their deadlines in that
-        order, shape (K,), in ns. The deadlines do not decrease, and no deadline is later than
+        The indices of the messages in playback order, shape (K,), and their deadlines in that
+        order, shape (K,), in ns. The deadlines never decrease, and no deadline is later than
         the time of its message.
     """
     indices = np.arange(len(times_ns), dtype=np.int64)
@@ -94,15 +93,15 @@ def _limit_by_later(values: Ints) -> Ints:
 
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """K messages of a log in compact form: a table of numbers, and one buffer with contents.
+    """K messages of a log in compact form: an integer table, and one buffer with the payloads.
 
-    A Python object per message would need much more memory. Several batches may share the same
-    buffer.
+    Storing one Python object per message would need much more memory. Several batches may share
+    the same buffer.
 
     Attributes:
-        rows: Table with a row per message, shape (K, 5). The columns are the deadline after the
-            start of the session in ns, the number of the channel, the number in the channel,
-            and the first and the end index of the payload in `data`.
+        rows: Table with one row per message, shape (K, 5). The columns are the deadline in ns
+            after the start of the session, the channel index, the number within the channel,
+            and the start and end index of the payload in `data`.
         data: The payloads, possibly with other bytes between them.
     """
 
@@ -116,7 +115,7 @@ class MessageBatch:
     def times_ns(self) -> Ints:
         """Time of each message, in ns after the start of the session, shape (K,).
 
-        The player publishes each message at this time, scaled by the speed of the replay.
+        The player publishes each message at this time, scaled by the playback speed.
         """
         return self.rows[:, _TIME]
 
@@ -124,13 +123,13 @@ class MessageBatch:
     def end_ns(self) -> int:
         """Time of the last message of the batch, in ns after the start of the session.
 
-        An empty batch has no such time, and raises IndexError.
+        Raises IndexError if the batch is empty.
         """
         return int(self.times_ns[-1])
 
     @property
     def channels(self) -> Ints:
-        """Number of the channel of each message, shape (K,).
+        """Channel index of each message, shape (K,).
 
         A channel is a topic of the log, such as the records of one arm.
         """
@@ -138,10 +137,10 @@ class MessageBatch:
 
     @property
     def numbers(self) -> Ints:
-        """Number of each of the K messages in its channel, shape (K,).
+        """Number of each of the K messages within its channel, shape (K,).
 
-        A channel contains the messages of one kind from one site. They are played in the order
-        of their numbers. The meaning of a number is described at `PlayedMessage`.
+        A channel contains all messages of one kind from one site, and they are played in order
+        of their numbers. See `PlayedMessage` for the meaning of a number.
         """
         return self.rows[:, _NUMBER]
 
@@ -151,43 +150,43 @@ class MessageBatch:
         return self.rows[:, _END] - self.rows[:, _START]
 
     def payload(self, index: int) -> bytes:
-        """Returns the encoded content of one message, exactly as it was first published.
+        """Returns the encoded payload of one message, exactly as it was first published.
 
         Args:
-            index: Index of the message in this batch, 0 for the first one.
+            index: Index of the message in this batch, starting at 0.
         """
         start, end = self.rows[index, _START:].tolist()
         return bytes(self.data[start:end])
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields each recorded message of this batch as a tuple, in playback order.
+        """Yields each message of this batch as a `PlayedMessage` tuple, in playback order.
 
-        The tuple `PlayedMessage` contains the time in ns after the start of the session, the
-        number of the channel, the number of the message in the channel, and the encoded
-        content.
+        The tuple contains the time in ns after the start of the session, the channel index, the
+        number of the message within the channel, and the encoded payload.
         """
         view = memoryview(self.data)
         for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])
 
     def part(self, indices: slice | Ints) -> "MessageBatch":
-        """Selects some of the messages, without copying their contents.
+        """Selects some of the messages, without copying their payloads.
 
         Args:
-            indices: Which messages are selected, and in which order.
+            indices: Messages to select, in the desired order.
 
         Returns:
-            The messages, which share the buffer of this batch.
+            A batch that shares the buffer of this one.
         """
         return MessageBatch(self.rows[indices], self.data)
 
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
-        """Divides the messages into pieces of limited size, without copying their payloads.
+        """Splits the batch into pieces of limited size, without copying the payloads.
 
-        A piece is sent at once, so its size limits the memory.
+        Each piece is sent in one go, so its size limits memory use.
 
         Args:
-            size: Approximate size of a piece, in bytes. A piece with one message may be larger.
+            size: Approximate size of a piece, in bytes. A piece that consists of a single
+                message may be larger.
 
         Yields:
             The pieces, in order.
@@ -204,8 +203,8 @@ class MessageBatch:
     def compact(self) -> "MessageBatch":
         """Copies the messages into a batch whose buffer contains only their payloads.
 
-        A batch may be a small part of a large buffer, which stays in memory as long as the
-        batch. The copy frees the large buffer.
+        A batch may be a small part of a large buffer, and keeps the whole buffer in memory.
+        Making a copy allows the large buffer to be freed.
         """
         buffer = memoryview(self.data)
         payload_spans = self.rows[:, _START:].tolist()
@@ -220,9 +219,7 @@ class MessageBatch:
 
 
 class BatchBuilder:
-    """Collects messages in the order of a log file, and sorts them for replaying.
-
-    To replay a log means to publish its messages again, each at its original time.
+    """Collects messages in file order, and sorts them for playback.
 
     Args:
         kept: Messages that were sorted in an earlier step but have not been played yet. They
@@ -242,22 +239,22 @@ class BatchBuilder:
 
     @property
     def memory(self) -> int:
-        """Memory that the messages added so far occupy, in bytes.
+        """Memory used by the messages added so far, in bytes.
 
-        The reader of a log limits it, because a log may be larger than the machine's memory.
+        The log reader limits this value, because a log may be larger than the machine's memory.
         """
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
-        """Adds a message in the order of the log file.
+        """Adds the next message of the log file.
 
-        All messages are sorted later for playing.
+        Messages are added in file order and sorted later.
 
         Args:
-            t_ns: Time of the message after the start of the session, in ns.
-            channel: Number of the channel.
-            number: Number of the message in its channel.
-            payload: Bytes of the message.
+            t_ns: Time of the message, in ns after the start of the session.
+            channel: Channel index.
+            number: Number of the message within its channel.
+            payload: Payload bytes of the message.
         """
         start = len(self._payloads)
         self._payloads += payload
@@ -265,13 +262,13 @@ class BatchBuilder:
         self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
-        """Returns the added messages in the order in which they are replayed.
+        """Returns the added messages in playback order.
 
-        Two files of a session may contain the same message, which is included only once.
+        A message that is contained in two files of a session is included only once.
 
         Returns:
-            The sorted messages. The time of each message is its deadline: the time at which it
-            is due, so that no message is later than the next message of its channel.
+            The sorted messages. The time of each is its deadline, which ensures that no message
+            is played after the next message of its channel.
         """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)

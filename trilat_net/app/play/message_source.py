@@ -1,15 +1,15 @@
-"""Supplies the player of a log with messages, so that it never waits for the disk.
+"""Supplies the player of a log with messages, without ever making it wait for the disk.
 
-To play a log means to publish its messages again, at the times of the original session. A short
-log is loaded into memory beforehand. A long log is read by a second process, the reader. It
-reads ahead and sends the messages through a pipe, in the order in which they are played.
+Playing a log means publishing its messages again, with the timing of the original session. A
+short log is loaded into memory beforehand. A long log is read by a second process, the reader,
+which reads ahead and sends the messages through a pipe in playback order.
 
 Invariant:
     - The method that returns the next messages never waits. If no messages are available yet,
       it returns `None`.
-    - The memory of the reader is bounded by two constants. `LIMIT_BYTES` is the largest size of
-      the messages that it stores for sorting. `HORIZON_NS` is the largest delay of a message in
-      the file, measured in the log, that the reader can correct.
+    - The memory of the reader is bounded by two constants. `LIMIT_BYTES` is the largest total
+      size of the messages held for sorting. `HORIZON_NS` is the largest delay of a message in
+      the file, measured in log time, that the reader can correct.
     - The reader waits while the pipe is full. The two processes share nothing except this pipe.
 """
 
@@ -79,21 +79,21 @@ class _ReadPiece(NamedTuple):
 
 
 class MessageSource:
-    """Supplies the messages of a log in the order in which they are replayed.
+    """Supplies the messages of a log in playback order.
 
-    A round is one pass through the log. If the log is replayed in a loop, its messages are
+    A round is one pass through the log. When a log is played in a loop, its messages are
     supplied round after round.
 
     Args:
-        header: Description of the files. The topics and damages that are found during reading
-            are added to it.
-        batch: All messages of the log. `None` if they are too many for the memory. In this case
+        header: Description of the files. Topics and damaged files discovered during reading are
+            added to it.
+        batch: All messages of the log. `None` if they do not fit in memory, in which case
             `start_reader` must be called.
 
     Attributes:
         ended: True if `poll` has returned all messages of this round.
         whole: True if all messages are in memory.
-        strays: Number of messages that were so late in the file that they are played out of
+        strays: Number of messages that appear so late in the file that they are played out of
             order.
     """
 
@@ -116,15 +116,14 @@ class MessageSource:
     def start_reader(
         self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool
     ) -> None:
-        """Starts the process that reads a long log from the disk while the log is played.
+        """Starts the process that reads a long log from the disk during playback.
 
-        The player must publish each message at its time, and therefore cannot wait for the
-        disk.
+        The player must publish each message on time, and therefore cannot wait for the disk.
 
         Args:
             paths: The files of the log.
             selection: Which messages are played, by channel and time.
-            loop: True if the process reads the files again and again.
+            loop: True to read the files repeatedly.
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, reader_pipe = context.Pipe(duplex=False)
@@ -139,12 +138,12 @@ class MessageSource:
         reader_pipe.close()
 
     def poll(self) -> MessageBatch | None:
-        """Returns the next messages to play, if any are available. It never waits.
+        """Returns the next messages to play, if any are available, without waiting.
 
-        Each call removes one item from the queue `_ahead`. The item is either a piece of the
-        log, the end of the round, or the error of the process that reads the log. The end of
-        the round also reports the strays, messages that are played out of order, and the
-        damaged ("torn") files. `restart` begins the next round.
+        Each call takes one item from the queue `_ahead`. The item is a piece of the log, the
+        end of the round, or the error of the process that reads the log. The end of the round
+        also reports the strays (messages that are played out of order) and the damaged files.
+        `restart` begins the next round.
 
         Returns:
             The messages. `None` if no messages are available now, or if the round has ended
@@ -172,14 +171,14 @@ class MessageSource:
         return None
 
     def fill(self) -> bool:
-        """Fetches messages in advance from the process that reads the log, without waiting.
+        """Prefetches messages from the process that reads the log, without waiting.
 
-        The player calls it while there is time before the next message. The bytes are read from
-        the pipe and decoded. `poll` then returns the messages.
+        The player calls this method when there is time before the next message. It reads bytes
+        from the pipe and decodes them, so that `poll` can return the messages.
 
         Returns:
             True if bytes were read. False if no bytes are available now, or if enough messages
-            have been fetched in advance.
+            have already been prefetched.
 
         Raises:
             RuntimeFault: The process that reads the log has failed.
@@ -217,10 +216,10 @@ class MessageSource:
                 self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Supplies the messages of the log again from the start, for replaying in a loop.
+        """Starts supplying the messages from the beginning again, for playback in a loop.
 
-        A log in memory is queued once more. For a long log, the reader process begins again on
-        its own.
+        A log in memory is queued again. For a long log, nothing needs to be done, since the
+        reader process starts over by itself.
         """
         self.ended = False
         if self._batch is not None:
@@ -228,7 +227,7 @@ class MessageSource:
             self._ahead.append(_RoundEnd(0, {}))
 
     def close(self) -> None:
-        """Ends the process that reads the log file. Further calls have no effect."""
+        """Ends the process that reads the log. May be called more than once."""
         if self._process is not None:
             self._process.terminate()
             self._process.join()
@@ -241,26 +240,26 @@ def sort_messages(
     step_ns: int = STEP_NS,
     limit_bytes: int = LIMIT_BYTES,
 ) -> Iterator[tuple[MessageBatch, int]]:
-    """Sorts the messages of a log into the order in which they are played.
+    """Sorts the messages of a log into playback order.
 
-    A message may be late in the file, because a site sent it again after a loss. Therefore
-    messages are stored for some time before they are yielded. The memory for this is limited.
+    A message may appear late in the file, because a site sent it again after a loss. Messages
+    are therefore buffered for a while before they are yielded, within a memory limit.
 
-    A stored message is yielded when a message arrives that is later by the horizon. Messages
-    are yielded at most once per step of the log, so that larger parts are sorted. The first
-    part is yielded when the horizon and one step have been read, and then one part after each
-    further step.
+    A buffered message is yielded once a message arrives that is later by at least the horizon.
+    Messages are yielded at most once per step of log time, so that larger parts are sorted at
+    once. The first part is yielded when the horizon and one step have been read, and another
+    part after each further step.
 
     Args:
-        messages: The messages, in the order of the file.
-        horizon_ns: Largest delay of a message in the file that is corrected, in ns of the log.
+        messages: The messages, in file order.
+        horizon_ns: Largest delay of a message in the file that is corrected, in ns of log time.
         step_ns: Duration of the part of the log that is sorted at a time, in ns.
-        limit_bytes: Largest memory of the stored messages, in bytes. If it is exceeded, the
+        limit_bytes: Memory limit for buffered messages, in bytes. If it is exceeded, the
             earlier half is yielded at once.
 
     Yields:
-        Messages in playback order, and the number of messages among them that were too late in
-        the file to be put in order.
+        Messages in playback order, and how many of them appeared too late in the file to be put
+        in order.
     """
     sorter = _MessageSorter()
     before_all_messages_ns = -(2**62)
@@ -296,29 +295,27 @@ class _MessageSorter:
 
     @property
     def memory(self) -> int:
-        """Memory of the waiting messages, in bytes."""
+        """Memory used by the buffered messages, in bytes."""
         return self._waiting.memory
 
     def add(self, message: PlayedMessage) -> None:
-        """Stores the next message of the file until it can be released in the right order.
+        """Buffers the next message of the file until it can be released in the right order.
 
         Args:
-            message: The next message in the order of the file.
+            message: The next message in file order.
         """
         t_ns, channel, number, payload = message
         self._waiting.add(t_ns, channel, number, payload)
 
     def release_until(self, until_ns: int) -> tuple[MessageBatch, int]:
-        """Removes the messages that are due up to a time, so that they can be played.
-
-        They are put in playback order, which may differ from the order of the file.
+        """Removes and returns the messages that are due up to a given time, in playback order.
 
         Args:
             until_ns: The time, in ns after the start of the session.
 
         Returns:
-            The messages in play order, and the number of strays: messages that came too late,
-            after one with a higher number in the same channel had been released.
+            The messages in playback order, and the number of strays (messages that came too
+            late, after one with a higher number in the same channel had been released).
         """
         sorted_messages = self._waiting.ordered()
         times_ns = sorted_messages.times_ns
@@ -326,11 +323,11 @@ class _MessageSorter:
         return self._release(sorted_messages, due_count)
 
     def release_half(self) -> tuple[MessageBatch, int]:
-        """Releases the earlier half of the waiting messages, because they need too much memory.
+        """Releases the earlier half of the buffered messages, because they use too much memory.
 
         Returns:
-            The messages in play order, and the number of strays: messages that came too late,
-            after one with a higher number in the same channel had been released.
+            The messages in playback order, and the number of strays (messages that came too
+            late, after one with a higher number in the same channel had been released).
         """
         ordered = self._waiting.ordered()
         return self._release(ordered, (len(ordered) + 1) // 2)
@@ -351,18 +348,18 @@ class _MessageSorter:
 def feed_player(
     pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool
 ) -> None:
-    """Sends the messages of a log to the player, until all are read or the player has ended.
+    """Sends the messages of a log to the player until all are sent or the player has ended.
 
-    This is the main function of the reader process. It reads a log that is too long for the
-    memory, while another process, the player, publishes its messages. Each pass through the log
-    is followed by a report of the damaged files and of the strays. These are messages so late
-    in the file that they could not be put in order.
+    This is the main function of the reader process. It reads a log that does not fit in memory,
+    while the player (another process) publishes its messages. Each pass through the log is
+    followed by a report of the damaged files and of the strays, which are messages that appear
+    too late in the file to be put in order.
 
     Args:
         pipe: Pipe to the player.
-        paths: The files.
+        paths: The files of the log.
         selection: Which messages are played.
-        loop: True if the files are read again and again.
+        loop: True to read the files repeatedly.
     """
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
@@ -370,8 +367,8 @@ def feed_player(
     def send(item: _ReadPiece | _RoundEnd | LogError) -> None:
         """Writes an item to the pipe, and waits until the player has made room.
 
-        The wait limits how far the reader runs ahead, and thus the memory that it needs. Each
-        item is preceded by its size, so that the player knows where it ends.
+        Waiting limits how far the reader runs ahead, and therefore its memory. Each item is
+        preceded by its size, which tells the player where the item ends.
         """
         pickled = pickle.dumps(item)
         sink.write(SIZE.pack(len(pickled)) + pickled)

@@ -1,12 +1,12 @@
-"""Plays a log on the network as a process, from the start of the session to the final summary.
+"""The playback process: plays a log on the network and ends with a summary for the user.
 
 A log contains the messages of a session, a joint run of several arms. The process opens the
-log, publishes its messages at the times of the original session, and reports to the user how
+log, publishes its messages with the timing of the original session, and reports to the user how
 late they were. To recorders and viewers, it looks like a running session.
 
 Invariant:
     - After the last message, the process stays on the network until its recorders have every
-      message, or send no more requests for missing messages.
+      message, or no longer request missing messages.
 """
 
 import math
@@ -47,16 +47,16 @@ PROGRESS_EVERY_NS = 500_000_000
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """Settings for replaying a log over the network, from the options of the command line.
+    """Settings for playing a log over the network, taken from the command-line options.
 
     Attributes:
         session: Name of the session in which the log is played.
-        rate: Speed of the playback, in seconds of the log per second. With `math.inf`, messages
-            are played as fast as all receivers accept them.
-        loop: True if the log is played again and again.
-        low_cpu: True if the player sleeps until a deadline, instead of polling the clock. This
-            needs less computing time, but is less precise.
-        needs_recorder: True if the playback waits for a recorder before it starts.
+        rate: Playback speed, in seconds of the log per second. With `math.inf`, messages are
+            played as fast as all receivers accept them.
+        loop: True to play the log repeatedly.
+        low_cpu: True to sleep until each deadline instead of polling the clock. This uses less
+            processor time, but is less precise.
+        needs_recorder: True to wait for a recorder before playback starts.
     """
 
     session: str
@@ -67,18 +67,18 @@ class PlayOptions:
 
 
 class PlaybackSummary(NamedTuple):
-    """Result of replaying a log: numbers of messages, duration and lateness, for the user.
+    """Result of playing a log: message counts, duration in s, and how late messages were.
 
     Attributes:
-        counts: Number of published messages, by the topic in the file.
+        counts: Number of published messages, keyed by topic in the file.
         rounds: Number of passes through the log that were started.
-        lateness: How late the messages were published after their deadlines. `None` if they had
+        lateness: How long after their deadlines the messages were published. `None` if they had
             no deadlines.
         took_s: Duration of the playback, in s.
         held_s: Time for which the player waited for slow receivers, in s.
         cut: How often a receiver was disconnected because it accepted no message for 5 s.
-        strays: Number of messages that could not be played in order, because their position in
-            the file was too far from their turn.
+        strays: Number of messages played out of order, because they appear too late in the
+            file.
         recorders: Number of recorders that were present after the last message.
         stored: True if all these recorders reported that they stored everything.
         refilled: Number of messages that were sent again to recorders that missed them.
@@ -100,18 +100,18 @@ class PlaybackSummary(NamedTuple):
 
 @dataclass
 class Playback:
-    """One replay of a log, which other programs see as a running session.
+    """One playback of a log, which looks like a running session to other programs.
 
-    The session has a name of its own. The object replies to other programs in place of the
+    The session has its own name. This object replies to other programs on behalf of the
     original arms, while its `Player` publishes the messages.
 
     Attributes:
         bus: Network connection of the player.
         clock: Clock of the player.
         header: Description of the recorded session.
-        source: Supplies the messages in the order in which they are played.
-        options: How the log is played.
-        stopped: Function that returns True if the playback must end.
+        source: Supplies the messages in playback order.
+        options: Playback settings.
+        stopped: Function that returns True when playback must end.
         say: Function that prints a line for the user.
         show: Function that shows the progress to the user.
     """
@@ -161,16 +161,16 @@ class Playback:
             self.show(progress)
 
     def play(self, start_ns: int | None) -> PlaybackSummary:
-        """Replays the log to its end, and stays until all recorders have every message.
+        """Plays the log to its end, and stays until all recorders have every message.
 
-        The method returns earlier if `stopped` returns True.
+        Returns earlier if `stopped` returns True.
 
         Args:
-            start_ns: Time in the log at which the playback begins, in ns after the start of the
-                recorded session. If `None`, playback begins with the first message.
+            start_ns: Log time at which playback begins, in ns after the start of the recorded
+                session. If `None`, playback begins with the first message.
 
         Returns:
-            The result of the playback, from which the user's summary is composed.
+            The result of the playback, on which the summary for the user is based.
         """
         clock = self.clock
         options = self.options
@@ -265,18 +265,18 @@ def play_log(
     say: Callable[[str], None],
     show: Callable[[PlayProgress], None],
 ) -> PlaybackSummary | None:
-    """Plays a log over the network, so that it looks like a running session to other programs.
+    """Plays a log over the network, so that other programs see a running session.
 
-    To play a log means to publish its messages again, at the times of the original session.
+    The messages are published again with the timing of the original session.
 
     Args:
         loaded: Description of the recorded session, and its messages if they are in memory.
-        paths: The files.
+        paths: The files of the log.
         selection: Which messages are played.
-        options: Options of the playback.
+        options: Playback settings.
         connection: How to connect to the network.
-        clock: The clock.
-        stopped: Function that returns True if the playback must end.
+        clock: Clock of this process.
+        stopped: Function that returns True when playback must end.
         say: Function that prints a line for the user.
         show: Function that shows the progress to the user.
 
@@ -284,7 +284,7 @@ def play_log(
         The summary. `None` if the playback was stopped before it began.
 
     Raises:
-        SessionError: A session of that name is running.
+        SessionError: A session of that name is already running.
         UsageError: An endpoint cannot be used.
         LogError: A file can no longer be read.
     """
@@ -370,11 +370,11 @@ def _open_bus(
 
 
 def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
-    """Returns the key under which a channel of the log is published in the playback's session.
+    """Returns the key under which a log channel is published in the playback's session.
 
-    The name of the recorded session is replaced. A topic that does not belong to this session
-    is appended in full to the name of the playback's session, so that it cannot equal another
-    topic.
+    The recorded session's name is replaced with that of the playback's session. A topic that
+    does not belong to the recorded session is appended in full to the playback's session name,
+    so that it cannot collide with another topic.
 
     Args:
         topic: Topic of the channel in the log.

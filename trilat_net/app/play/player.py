@@ -1,10 +1,10 @@
-"""Publishes the messages of a recorded session in order, each at its time.
+"""Publishes the messages of a recorded session in order, each at its scheduled time.
 
-The time at which a message is due, its deadline, is a linear function of its time in the log.
-The function contains the start time and the speed of the replay. The player sleeps until
-shortly before a deadline and then polls the clock. It does other work (replies to other
-programs, reading in advance, progress) in the time that is left between deadlines. If no time
-is left, the player still does some of this work a hundred times a second.
+The deadline of a message (the time at which it is due) is a linear function of its time in the
+log, determined by the start time and the playback speed. The player sleeps until shortly before
+a deadline and then polls the clock. Between deadlines it does other work: replies to other
+programs, prefetching, and progress reports. If there is no time between deadlines, it still
+does some of this work a hundred times a second.
 
 Invariant:
     - The deadlines depend only on the times in the log and on one start time, so that a late
@@ -40,16 +40,16 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Schedule of a replay: converts times in a log to times on the player's clock.
+    """Schedule of a playback: converts log times to times on the player's clock.
 
-    The conversion is a linear function of the start time and the speed of the replay.
+    The conversion is a linear function, given by the start time and the playback speed.
 
     Attributes:
-        origin_ns: Time on the clock at which messages of the time `start_ns` are due, in ns.
-        start_ns: Time in the log at which the playback begins, in ns after the start of the
-            recorded session.
-        rate: Speed of the playback, in seconds of the log per second. With `math.inf`, all
-            messages are due at the origin.
+        origin_ns: Time on the clock at which messages with log time `start_ns` are due, in ns.
+        start_ns: Log time at which playback begins, in ns after the start of the recorded
+            session.
+        rate: Playback speed, in seconds of the log per second. With `math.inf`, all messages
+            are due at the origin.
     """
 
     origin_ns: int
@@ -57,43 +57,38 @@ class Pace:
     rate: float = 1.0
 
     def due_ns(self, t_ns: int) -> int:
-        """Computes the deadline of a message: the time on the player's clock when it is due.
+        """Computes the deadline of a message, in ns on the player's clock.
 
         At double speed, for example, a message 4 s after the start is due after 2 s.
 
         Args:
             t_ns: Time of the message in the log, in ns after the start of the recorded session.
-
-        Returns:
-            The deadline on the clock, in ns.
         """
         return self.origin_ns + round((t_ns - self.start_ns) / self.rate)
 
     def later(self, length_ns: int) -> "Pace":
-        """Returns the deadlines for the next round, when a log is replayed in a loop.
+        """Returns the schedule for the next round when a log is played in a loop.
 
         Args:
-            length_ns: Time in the log after which the next round begins, counted from the
-                beginning of this round, in ns.
+            length_ns: Log time from the start of this round to the start of the next one, in
+                ns.
 
         Returns:
-            The conversion from times in the log to deadlines for the next round. It has the
-            same speed.
+            A schedule with the same speed that is shifted to the next round.
         """
         return Pace(self.due_ns(self.start_ns + length_ns), self.start_ns, self.rate)
 
     @staticmethod
     def parse_rate(text: str) -> float:
-        """Parses the option `--rate`, the speed of a playback relative to the recorded run.
+        """Parses the option `--rate`, the playback speed relative to the recorded run.
 
-        For example, "2" plays a log twice as fast. The texts "max" and "0" mean as fast as
-        possible.
+        For example, "2" plays a log twice as fast. Both "max" and "0" mean as fast as possible.
 
         Returns:
-            Seconds of the log per second, `math.inf` for as fast as possible.
+            Seconds of the log per second, or `math.inf` for as fast as possible.
 
         Raises:
-            UsageError: The text is not a rate from `SLOWEST` to `FASTEST`.
+            UsageError: The argument is not a rate from `SLOWEST` to `FASTEST`.
         """
         if text.strip().lower() == "max":
             return math.inf
@@ -114,14 +109,14 @@ class Pace:
 
 
 def wait_until(clock: Clock, due_ns: int, spin_ns: int) -> int:
-    """Waits until a deadline: sleeps at first, and polls the clock shortly before the deadline.
+    """Waits until a deadline in ns: sleeps at first, then polls the clock just before it.
 
     Sleeping alone would end about 60 us late, and polling alone would keep a processor busy.
 
     Args:
-        clock: The clock.
+        clock: Clock to wait on.
         due_ns: The deadline. If it has passed, the function returns at once.
-        spin_ns: Time before the deadline from which the clock is polled, in ns. With 0, the
+        spin_ns: How long before the deadline to start polling the clock, in ns. With 0, the
             clock is not polled, and the function may return about 60 us late.
 
     Returns:
@@ -139,13 +134,13 @@ LATENESS_LIMIT_US = 100_000
 
 
 class LatenessHistogram:
-    """Counts the published messages of a replay by their lateness after the deadline.
+    """Histogram of how late messages were published after their deadlines, in us.
 
-    Percentiles can be computed at any time from the counts, without storing every lateness. The
-    width of an interval is 1 us.
+    Percentiles can be computed from the counts at any time, without storing the lateness of
+    every message. The bin width is 1 us.
 
     Attributes:
-        max_us: Largest lateness, in us.
+        max_us: Maximum lateness, in us.
     """
 
     class Summary(NamedTuple):
@@ -164,9 +159,9 @@ class LatenessHistogram:
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Counts how late one message was published.
+        """Adds the lateness of one published message, in ns.
 
-        The method is called for every message, and must therefore be fast.
+        This method is called for every message, so it must be fast.
 
         Args:
             late_ns: Time from the deadline of the message to its publication, in ns.
@@ -178,7 +173,7 @@ class LatenessHistogram:
             self.max_us = late_us
 
     def summary(self) -> Summary | None:
-        """Computes the statistics of all messages that were counted.
+        """Computes the statistics of all messages counted so far, in us.
 
         The p-th percentile is the smallest lateness up to which at least p percent of the
         messages were counted. The comparison 100 * (messages up to here) >= p * (all messages)
@@ -224,12 +219,12 @@ Publish = Callable[[bytes], None]
 
 
 class PlayProgress(NamedTuple):
-    """Progress of replaying a log, for the line that the user sees in the terminal.
+    """Progress of playing a log, shown to the user as a line in the terminal.
 
     Attributes:
         position_ns: Time of the next message, in ns after the start of the recorded session.
         published: Number of messages published so far.
-        late_max_us: Largest lateness of these messages, in us.
+        late_max_us: Maximum lateness of these messages, in us.
     """
 
     position_ns: int
@@ -238,27 +233,26 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """Publishes the messages of a recorded log again, each at its deadline, once or in a loop.
+    """Publishes the messages of a recorded log again on schedule, once or in a loop.
 
-    Programs such as a monitor then work as if the session were running.
+    To programs such as a monitor, the session then seems to be running.
 
     Args:
-        source: Supplies the messages in the order in which they are played.
+        source: Supplies the messages in playback order.
         history: Stores the messages, so that recorders can request them again.
         clock: The clock.
-        publisher: Function that returns, for the number of a channel, the function that
-            publishes a message on this channel.
-        serve: Function that does some other work, such as replies. It is called between
-            messages.
-        stopped: Function that returns True if the playback must end.
-        low_cpu: True if the player sleeps until a deadline, instead of polling the clock.
+        publisher: Function that takes a channel index and returns a function that publishes a
+            message on that channel.
+        serve: Function that does other work, such as sending replies. Called between messages.
+        stopped: Function that returns True when playback must end.
+        low_cpu: True to sleep until each deadline instead of polling the clock.
 
     Attributes:
-        counts: Number of published messages, by the number of the channel.
+        counts: Number of published messages, keyed by channel index.
         rounds: Number of passes through the log that were started.
-        lateness: Histogram of the time from deadline to publication of the messages.
+        lateness: Histogram of the time from the deadline of a message to its publication.
         stalls: Number of publications that took so long that a receiver lost its connection.
-        held_ns: Time that publications waited for receivers, in ns.
+        held_ns: Total time that publications waited for receivers, in ns.
     """
 
     def __init__(
@@ -295,9 +289,9 @@ class Player:
         self._first_batch: MessageBatch | None = None
 
     def prepare(self) -> int | None:
-        """Waits for the first messages, so that playing can begin without delay.
+        """Waits for the first messages, so that playback can begin without delay.
 
-        Messages that are read from the disk or decoded only when they are due would be late.
+        Messages that are only read or decoded when they are due would be published late.
 
         Returns:
             The time of the first message, in ns after the start of the recorded session. `None`
@@ -310,20 +304,19 @@ class Player:
         return self._position_ns
 
     def play(self, pace: Pace, *, loop: bool = False) -> None:
-        """Plays all messages, until the end of the log or until the playback is stopped.
+        """Plays all messages, until the end of the log or until playback is stopped.
 
-        A round is one pass through the log. The next round begins `LOOP_PAUSE_NS` after the
-        last message of the present round.
+        A round is one pass through the log. In a loop, the next round begins `LOOP_PAUSE_NS`
+        after the last message of the current one.
 
         Every message is stored in the history before it is played, because recorders may
-        request it again. A log that is entirely in memory is stored once, in the first round.
-        If the log is read while it is played, the history holds only recent messages, which
-        differ in each round. The history is therefore cleared before the next round.
+        request it again. A log held entirely in memory is stored once, in the first round. For
+        a log that is read during playback, the history holds only recent messages, which differ
+        in each round. The history is therefore cleared before the next round.
 
         Args:
-            pace: Start time and speed of the playback, which determine the deadlines of the
-                messages.
-            loop: True to play the log again and again, until the playback is stopped.
+            pace: Start time and playback speed, which determine the deadlines of the messages.
+            loop: True to play the log repeatedly until playback is stopped.
         """
         is_log_in_memory = self._source.whole
         while not self._stopped():

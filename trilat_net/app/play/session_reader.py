@@ -1,8 +1,8 @@
-"""Reads from a log the messages that will be played, selected by channel and time.
+"""Reads the messages to be played from a log, selected by channel and time.
 
-To play a log means to publish its messages on the network again, at the times of the original
-session. A session is a joint run of several sites, each of which controls one arm. Each start
-of a site has a random number, the boot, by which its messages are identified.
+Playing a log means publishing its messages on the network again, with the timing of the
+original session. Messages are identified by the boot of the site, a random number that is drawn
+each time the site starts.
 
 Invariant:
     - Payloads are passed on unchanged. Only the number of an event and the boot are decoded.
@@ -46,16 +46,16 @@ PlayTime = Literal["publish", "log"]
 
 @dataclass(frozen=True, slots=True)
 class PlaySelection:
-    """Which messages of a log are replayed, by channel and by time.
+    """Selects which messages of a log are played, by channel and by time in ns.
 
     Attributes:
-        channels: Filter of the channels. If it includes no channel explicitly, the channels of
-            the sites are played.
-        start_ns: Earliest time of a message, in ns after the start of the session. `None` if
-            there is no limit.
-        stop_ns: Latest time of a message, in ns after the start of the session. `None` if there
-            is no limit.
-        time: Whether the sending time or the arrival time of a message counts.
+        channels: Channel filter. If it includes no channel explicitly, the channels of the
+            sites are played.
+        start_ns: Earliest time of a message, in ns after the start of the session. `None` for
+            no limit.
+        stop_ns: Latest time of a message, in ns after the start of the session. `None` for no
+            limit.
+        time: Whether the sending time or the arrival time of a message is used.
     """
 
     channels: ChannelFilter = ALL_CHANNELS
@@ -64,10 +64,10 @@ class PlaySelection:
     time: PlayTime = "publish"
 
     def accepts(self, topic: str, sites: Collection[str]) -> bool:
-        """Returns True if the messages of a channel (topic) of the log are replayed.
+        """Returns True if the messages of a channel (topic) of the log are played.
 
-        By default, these are the channels of the arms. If the user includes channels
-        explicitly, only the user's filter counts.
+        By default, the channels of the sites are played. If the user includes channels
+        explicitly, only the user's filter applies.
 
         Args:
             topic: Topic of the channel, such as "/trilat/paper/m1/state".
@@ -82,10 +82,10 @@ class PlaySelection:
         return is_candidate and self.channels.accepts(key)
 
     def contains(self, t_ns: int) -> bool:
-        """Returns True if a time lies in the selected part of the session, such as 5 s to 10 s.
+        """Returns True if a time in ns lies in the selected interval, such as 5 s to 10 s.
 
         Args:
-            t_ns: The time, for example of a message, in ns after the start of the session.
+            t_ns: Time, for example of a message, in ns after the start of the session.
         """
         is_before = self.start_ns is not None and t_ns < self.start_ns
         is_after = self.stop_ns is not None and t_ns > self.stop_ns
@@ -101,24 +101,22 @@ class PlaySelection:
         duration_s: float | None,
         time: str,
     ) -> "PlaySelection":
-        """Parses the options of a command that select which messages of a log are replayed.
+        """Parses the command-line options that select which messages of a log are played.
 
-        The user limits the part of the session by `--start`, and by either `--stop` or
+        The user limits the time interval with `--start` and with either `--stop` or
         `--duration`.
 
         Args:
-            include: Key expressions of `--include`.
-            exclude: Key expressions of `--exclude`.
-            start_s: Value of `--start`, in s after the start of the session. `None` if it is
-                absent.
-            stop_s: Value of `--stop`, in s after the start of the session. `None` if it is
-                absent.
-            duration_s: Value of `--duration`, in s, instead of `stop_s`. `None` if it is
+            include: Key expressions from `--include`.
+            exclude: Key expressions from `--exclude`.
+            start_s: Value of `--start`, in s after the start of the session. `None` if absent.
+            stop_s: Value of `--stop`, in s after the start of the session. `None` if absent.
+            duration_s: Value of `--duration`, in s, an alternative to `stop_s`. `None` if
                 absent.
             time: Value of `--time`, see `PlayTime`.
 
         Raises:
-            UsageError: The options contradict each other, or an option is not valid.
+            UsageError: The options contradict each other, or an option is invalid.
         """
         if time not in get_args(PlayTime):
             raise UsageError(
@@ -196,17 +194,17 @@ def _decode_header(payload: bytes) -> _PayloadHeader:
 
 @dataclass(slots=True)
 class SessionHeader:
-    """Description of the recorded session that is replayed, collected while files are read.
+    """Description of the recorded session, collected while its files are read.
 
     Attributes:
         session: Name of the recorded session.
-        scenario: Scenario of the session, which describes the arms and the network.
-        scenario_text: Text of the scenario, as stored in the log.
-        fingerprint: Text that identifies the platform on which the session was recorded.
-        version: Version of the messages' format. It is 0 if it is unknown.
+        scenario: Scenario of the session.
+        scenario_text: TOML text of the scenario, as stored in the log.
+        fingerprint: String that identifies the platform on which the session was recorded.
+        version: Version of the message format. 0 if it is unknown.
         boots: For each site, the random number that identifies its first start.
-        topics: Topics of the channels that are played. The index of a topic is the number of
-            its channel.
+        topics: Topics of the channels that are played. The index of a topic is its channel
+            index.
         torn: The damaged files, with the reason.
         first_ns: Time of the earliest message so far, in ns after the start of the session.
         last_ns: Time of the latest message so far, in ns after the start of the session.
@@ -266,10 +264,10 @@ class _PlayedChannel:
         self._starts: dict[int, int] = {}
 
     def find_number(self, sequence: int, payload: bytes, t_ns: int) -> int:
-        """Finds the number by which a message is ordered among the messages of its channel.
+        """Returns the number that determines the position of a message within its channel.
 
-        The messages of a channel are played in the order of their numbers. Three kinds of
-        numbers make this order equal to the order of the original publication:
+        The messages of a channel are played in order of these numbers. To reproduce the order
+        of the original publication, three kinds of numbers are used:
 
         - Records and statistics of a site are numbered by their control period (tick). A site
           that was started again continues these numbers.
@@ -277,8 +275,8 @@ class _PlayedChannel:
           starts, a multiple of `NUMBERS_OF_A_START` is added.
         - Other messages have no number. Their time is used instead.
 
-        The method must be called once for each message of the file, in the order of the file,
-        because it counts the events and the starts of the site.
+        Call this method exactly once per message, in file order, because it counts the events
+        and the starts of the site.
 
         Args:
             sequence: Sequence number of the message in the file.
@@ -286,7 +284,7 @@ class _PlayedChannel:
             t_ns: Time of the message, in ns after the start of the session.
 
         Returns:
-            The number, as `PlayedMessage` defines it.
+            The number, as defined by `PlayedMessage`.
         """
         if self.kind in (topics.STATE, topics.LINK):
             return number_message(self.kind, sequence, self.rate_hz)
@@ -309,13 +307,13 @@ class _PlayedChannel:
 
 
 class SessionReader:
-    """Reads the messages of a recorded session from its log files, for replaying them.
+    """Reads the messages of a recorded session from its log files, for playback.
 
     Args:
-        paths: The files of the log. Several files are the parts of a session, in their order.
+        paths: The files of the log. Several files are the parts of a session, in order.
         selection: Which messages are played, by channel and time.
-        progress: Function that is called now and then with the number of bytes read and their
-            total.
+        progress: Function that is called periodically with the number of bytes read and the
+            total number of bytes.
 
     Attributes:
         header: Description of the session. `None` before the first message.
@@ -330,7 +328,7 @@ class SessionReader:
         self._progress = progress
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields the messages to replay from all files of a log, in the order of each file.
+        """Yields the messages to play, file by file, in the order in which they are stored.
 
         Raises:
             LogError: A file is missing, is not a log of trilat-net, or belongs to a different
@@ -465,20 +463,21 @@ def preload_messages(
     limit_bytes: int,
     progress: Progress | None = None,
 ) -> tuple[SessionHeader, MessageBatch | None]:
-    """Reads the description of a session, and its selected messages if they fit into memory.
+    """Reads the description of a session, and its selected messages if they fit in memory.
 
-    A short log is played from memory. If the messages need more memory, a reader process is
-    started later, and here the file is searched only for the first messages of all sites.
+    A short log is played from memory. If the messages need more memory than allowed, they are
+    left to a reader process that is started later, and the file is searched only for the first
+    messages of all sites.
 
     Args:
-        paths: The files.
+        paths: The files of the log.
         selection: Which messages are played.
-        limit_bytes: Largest memory of the messages, in bytes.
-        progress: Function that is called now and then with the number of bytes read and their
-            total.
+        limit_bytes: Memory limit for the messages, in bytes.
+        progress: Function that is called periodically with the number of bytes read and the
+            total number of bytes.
 
     Returns:
-        The description of the session, and the messages in play order. `None` takes the place
+        The description of the session, and the messages in playback order, or `None` in place
         of the messages if they need more memory.
 
     Raises:

@@ -1,11 +1,9 @@
-"""Replies to other programs in place of the original sites while a log is played.
+"""Replies to other programs on behalf of the original sites while a log is played.
 
-A site is a process that runs one robot arm and publishes messages. A log contains the messages
-of a session. When it is played, the messages are published again, but the sites no longer
-exist. This module announces the sites on the network, replies to queries for their identities
-and to pings, and sends messages again to recorders that missed them. `PlayedHistory` stores the
-messages for this purpose. To other programs, a log that is played therefore looks like a
-running session.
+When a log is played, the messages of its session are published again, but the sites no longer
+exist. This module announces the sites on the network, replies to identity queries and pings,
+and resends messages that recorders missed, using the messages stored in `PlayedHistory`. To
+other programs, the playback therefore looks like a running session.
 
 Invariant:
     - Recorders, viewers and pings receive everything that they would receive from a running
@@ -59,15 +57,15 @@ class _ChannelMessages(NamedTuple):
     batch: MessageBatch
 
     def list_from(self, number: int) -> list[tuple[int, int]]:
-        """Lists the stored messages from a given number on, for a reply to a recorder.
+        """Lists the stored messages starting at a given number, for a reply to a recorder.
 
         Args:
-            number: Smallest number of a message in the list.
+            number: Smallest message number to include.
 
         Returns:
-            The number of each message in its channel, and its index in the batch, in ascending
-            order. The list has at most one entry more than a reply may contain, so that the
-            caller can detect a full reply.
+            Pairs of the number of a message within its channel and its index in the batch, in
+            ascending order. The list has at most one entry more than a reply may contain, which
+            lets the caller detect a full reply.
         """
         start = int(np.searchsorted(self.numbers, number))
         selected = slice(start, start + BACKFILL_MESSAGES + 1)
@@ -77,16 +75,16 @@ class _ChannelMessages(NamedTuple):
 
 
 class PlayedHistory:
-    """Stores replayed messages, so that recorders that missed some can request them again.
+    """Stores played messages, so that recorders that missed some can request them again.
 
     Recorders request lost messages of a real session in the same way.
 
     Args:
-        kept_ns: How long a message is stored after it is played, in ns of the log's time. If
-            `None`, all messages are stored.
+        kept_ns: How long a message is stored after it is played, in ns of log time. If `None`,
+            all messages are stored.
 
     Attributes:
-        next_numbers: Number that follows the last played message, by channel.
+        next_numbers: For each channel, the number after that of the last played message.
     """
 
     def __init__(self, kept_ns: int | None = None) -> None:
@@ -97,10 +95,10 @@ class PlayedHistory:
     def add(self, batch: MessageBatch) -> None:
         """Stores messages before they are played, so that recorders can request them again.
 
-        Messages that are older than the limit `kept_ns` are removed.
+        Removes messages older than `kept_ns`.
 
         Args:
-            batch: The messages, in the order in which they are played.
+            batch: The messages, in playback order.
         """
         for channel in np.unique(batch.channels).tolist():
             indices = np.flatnonzero(batch.channels == channel)
@@ -116,21 +114,21 @@ class PlayedHistory:
     def clear(self) -> None:
         """Removes all stored messages, before a log is played again from its beginning.
 
-        The next number of each topic (`next_numbers`) is kept, so that the numbers of messages
-        do not start again.
+        The next number of each channel (`next_numbers`) is kept, so that message numbers
+        continue.
         """
         self._messages.clear()
 
     def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Finds consecutive replayed messages for one reply to a recorder that missed them.
+        """Finds consecutive played messages for one reply to a recorder that missed them.
 
         A reply has no gaps. It contains at most `BACKFILL_MESSAGES` messages and, unless a
         single message is larger, at most `BACKFILL_BYTES` bytes.
 
         Args:
-            channel: Number of the channel.
-            first: Number of the first requested message. If it is not kept, the reply begins
-                with the next message that is kept.
+            channel: Channel index.
+            first: Number of the first requested message. If it is no longer stored, the reply
+                begins with the next message that is.
             last: Number of the last requested message.
 
         Returns:
@@ -179,10 +177,10 @@ _MAX_RECORDER_EVENTS = 256
 
 
 class SiteStandIns:
-    """Replies in place of the sites of a recorded session while the session is replayed.
+    """Replies on behalf of the sites of a recorded session while its log is played.
 
-    To other programs, a log that is replayed thus looks like a running session: its arms
-    announce themselves, reply to queries, and send messages again that a recorder missed.
+    This makes the playback look like a running session: its arms announce themselves, reply to
+    queries, and resend messages that a recorder missed.
 
     Args:
         bus: Network connection of the player.
@@ -192,8 +190,8 @@ class SiteStandIns:
         history: The messages that were played.
 
     Attributes:
-        recorders: Identifiers of the recorders that are present, as text. A recorder gets a new
-            random identifier at each start.
+        recorders: Identifiers of the recorders that are present, as strings. A recorder gets a
+            new random identifier at each start.
         refilled: Number of messages that were sent again to recorders.
     """
 
@@ -236,8 +234,7 @@ class SiteStandIns:
     def start_session(self, epoch_mono_ns: int) -> None:
         """Announces the session as running, so that recorders and viewers join it.
 
-        A site is the process that ran an arm when the log was recorded. During a playback, the
-        identity of the site states the start time of the playback.
+        In the announced identities of the sites, the start time is that of the playback.
 
         Args:
             epoch_mono_ns: Start time of the session (tick 0) on the monotonic clock, in ns.
@@ -248,14 +245,14 @@ class SiteStandIns:
             stand_in.start_session(epoch_mono_ns, epoch_unix_ns, self._header.boots)
 
     def serve_queries(self) -> bool:
-        """Replies to waiting requests of other programs in the name of the original sites.
+        """Replies to pending requests of other programs on behalf of the original sites.
 
-        It replies to all queries for identities, but to at most one request of a recorder for
-        missing messages, to keep the call short. It also updates which recorders are present,
-        and which messages they have stored.
+        To keep the call short, at most one request for missing messages is answered, but all
+        identity queries are. The method also updates which recorders are present, and which
+        messages they have stored.
 
         Returns:
-            True if a request of a recorder was processed. More requests may be waiting then.
+            True if a recorder's request was processed, in which case more may be pending.
         """
         for site, stand_in in self._sites.items():
             stand_in.answer_identity_queries(partial(self._count_ticks, site))
@@ -286,22 +283,21 @@ class SiteStandIns:
         return self._history.next_numbers.get(channel, 0)
 
     def are_recorders_listening(self) -> bool:
-        """Checks whether all recorders on the network are ready to receive replayed messages.
+        """Returns True if all recorders on the network are ready to receive played messages.
 
-        Returns:
-            True if all of them have replied, so that they will receive the messages.
+        A recorder is ready once it has replied.
         """
         self._listening |= {str(info.boot) for info in self._recorder_query.poll()}
         return not self.recorders - self._listening
 
     def have_stored(self, recorders: Collection[str]) -> bool:
-        """Returns True if recorders have reported that they stored all messages of every site.
+        """Returns True if the recorders have reported that they stored every site's messages.
 
         The player may then leave, because no recorder will request a message again.
 
         Args:
-            recorders: The recorders. Each is identified by the random number of its start, as
-                text.
+            recorders: Identifiers of the recorders: the random numbers of their starts, as
+                strings.
         """
         all_sites = self._sites.keys()
         for recorder in recorders:
