@@ -53,7 +53,7 @@ from .running_digest import DIGESTS, RECOVERED, DigestState
 from .session_accounts import SessionAccounts
 from .torn_chunk import TornChunk
 
-_UNOPENED = "other MCAP programs can open the new file, but trilat-net cannot"
+_UNOPENED = "other MCAP programs open the new file, commands of trilat-net do not"
 _UNPROVEN = "has no checksum, and the log has no scenario by which to check messages"
 _NO_SCENARIO = "the log has no scenario, without which no message can be checked"
 _MAX_REASONS = 3
