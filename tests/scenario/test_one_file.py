@@ -44,7 +44,7 @@ class Tremor(OwnActor, frozen=True, kw_only=True, tag="tremor"):
         return np.array(self.stiffness_nm_rad) * (target - at)
 """
 DELAY = """
-from trilat_net.core.links.delay import draw_pair
+from trilat_net.core import draw_pair
 from trilat_net.scenario.delay_models import Milliseconds, OwnDelay
 
 

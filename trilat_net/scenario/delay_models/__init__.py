@@ -376,7 +376,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         """Computes the delay of one message and stores it in `now.drawn_us`, in microseconds.
 
         This method is compiled. It may use the sample number `now.sample` and the send time
-        `now.stamp_ns`. Draw random numbers with `core.links.delay.draw_pair` only: its results
+        `now.stamp_ns`. Draw random numbers with `trilat_net.core.draw_pair` only: its results
         depend only on the key of the link and an index, so a repeated run draws the same
         numbers (law L4 of docs/develop/design.md).
 
