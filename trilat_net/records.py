@@ -136,7 +136,8 @@ class TickRecord(NamedTuple):
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         """Returns the motion and external torque that an arm sends to the others in one tick.
 
-        The values describe the end effector in task space, and the joints otherwise.
+        If the arm is controlled in task space, the values describe its end effector, otherwise
+        its joints.
 
         Returns:
             The position, the velocity and the external torque, each with one entry per

@@ -243,7 +243,7 @@ class FileOverview(Result):
         return f"{paths}: {message_count}"
 
     def to_dict(self) -> JsonObject:
-        """Returns the content of the files, with the keys of `trilat log info --json`.
+        """Returns a summary of the files, with the keys of `trilat log info --json`.
 
         For example, the entry "channels" maps each topic to facts such as its number of
         messages.

@@ -272,7 +272,7 @@ class _ChannelCheck:
         return ""
 
     def check_message(self, stored: McapMessage, offset: int) -> None:
-        """Checks that a message can be decoded, is in its place, and has a plausible time.
+        """Checks that a message can be decoded, is in order, and has a plausible time stamp.
 
         The sender, number and sending time in the message must match those that the file states
         for it. Problems are added to the findings.

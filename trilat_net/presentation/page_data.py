@@ -234,7 +234,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     class Table(msgspec.Struct, frozen=True):
         """Values of one arm over time, as stored in the report's web page.
 
-        A table has one row per displayed tick. The lines of charts refer to its columns.
+        A table has one row per displayed tick. Each line of a chart plots one of its columns.
 
         Attributes:
             rate_hz: Tick rate of the site, used to convert ticks to times.

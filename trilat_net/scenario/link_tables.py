@@ -56,8 +56,8 @@ def complete_link(
 ) -> TomlTable:
     """Returns the complete table of a link, or of a site's delayed view of its peers.
 
-    A view is the delay with which the user of a site sees the other arms. It has the keys of a
-    link but does not inherit their values.
+    A view specifies how much later the user of a site sees the other arms move. It has the keys
+    of a link but does not inherit their values.
 
     Args:
         written: The link table as written by its author.

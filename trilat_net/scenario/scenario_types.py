@@ -179,8 +179,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def law_situations(self) -> Iterator[tuple[str, LawSettings, LawSituation]]:
         """Yields each site with its control law and the quantities that affect stability.
 
-        These are the delays, the rates of the control loops, and the dominance factors. A law
-        with a stability condition evaluates the condition from them.
+        These are the delays, the rates of the control loops, and the dominance factors. If the
+        law has a stability condition, it uses these quantities to evaluate the condition.
         """
         delay_s = np.zeros((len(self.names), len(self.names)))
         for name, link in self.links.items():

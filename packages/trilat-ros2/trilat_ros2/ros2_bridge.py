@@ -282,7 +282,7 @@ class DominanceTopic:
         self._requested = dict(peer_shares)
 
     def send_request(self) -> None:
-        """Requests the site to use the newest dominance factors, and waits for its reply.
+        """Asks the site to use the newest dominance factors, and waits for its reply.
 
         Does nothing if no new dominance factors have arrived since the last call.
 

@@ -54,7 +54,7 @@ class BridgeEnds(NamedTuple):
         return self.table.find(self.session, site, name)
 
     def write_rviz_config(self, scenario: Scenario, path: Path) -> None:
-        """Writes a configuration with which the viewer RViz shows the arms of the session.
+        """Writes an RViz configuration that displays the arms of the session.
 
         Args:
             scenario: Scenario of the session.

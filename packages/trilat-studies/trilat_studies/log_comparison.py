@@ -124,7 +124,7 @@ class MetricComparison(NamedTuple):
     def to_dict(self) -> dict[str, Any]:
         """Converts the comparison to plain values for JSON.
 
-        A missing value is `None`, next to the reason why it is missing.
+        A missing value is `None`, and a separate entry states the reason.
         """
         rows = []
         for row in self.rows:

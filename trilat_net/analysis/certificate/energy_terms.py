@@ -642,9 +642,9 @@ class SiteMotion:
     def compute_work(self) -> "dict[str, Increment]":
         """Computes the work on a site in each tick period, by source.
 
-        The sources are all effects that can raise the site's energy function V_i, other than
-        the transfer between sites: operators, environments, links, changes of settings, and
-        limits.
+        The sources are operators, environments, links, changes of settings, and limits:
+        everything that can raise the site's energy function V_i except the transfer between
+        sites.
         """
         torque = self.torque
         records = self.records

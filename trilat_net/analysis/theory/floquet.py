@@ -218,8 +218,8 @@ class CoupledTicks(NamedTuple):
     sites.
 
     Attributes:
-        S: Matrix that maps the states of all sites to their next tick, excluding the effects of
-            sites on each other, shape (n, n). It is block diagonal.
+        S: Matrix that maps the states of all sites to their values at the next tick, excluding
+            the effects of sites on each other, shape (n, n). It is block diagonal.
         effects: For each pair (i, j), the effect of the states of site j on the states of site
             i, shape (n, n). Pairs without an effect are missing.
         names: Names of the states.

@@ -777,8 +777,8 @@ class Following(NamedTuple):
             force: Force F along the followed axes, shape (m, ...).
 
         Returns:
-            Torque at the n joints, shape (n, ...). If joints follow instead of the end
-            effector, the argument itself.
+            Torque at the n joints, shape (n, ...). If the arm follows with its joints instead
+            of its end effector, the argument is returned unchanged.
         """
         if self.J is None:
             return force

@@ -211,7 +211,7 @@ class TwinGrowth(NamedTuple):
 
     @property
     def trend(self) -> EnvelopeTrend:
-        """Whether the effect of the worst push grows or decays, as a class.
+        """Trend of the effect of the worst push, for example growing or decaying.
 
         The worst push is the one whose effect grows most or decays most slowly. The trend is
         undecided if there are no pushes.

@@ -176,8 +176,8 @@ class LatenessHistogram:
         """Computes the statistics of all messages counted so far, in us.
 
         The p-th percentile is the smallest lateness up to which at least p percent of the
-        messages were counted. The comparison 100 * (messages up to here) >= p * (all messages)
-        uses integers and is therefore exact.
+        messages were counted. The test 100 * (messages with at most this lateness) >= p * (all
+        messages) uses integers and is therefore exact.
 
         Returns:
             Median, 99th percentile and maximum of the lateness, in us. `None` if no message was

@@ -520,7 +520,7 @@ class LaneEpisodes(LaneRun):
         return self._read(self._site, self._ended.site_rows, self._layout.site, name, dtype)
 
     def read_links(self, name: str, i: int) -> NDArray[Any]:
-        """Returns one quantity of the network links over which site `i` receives, in all runs.
+        """Returns one quantity of the links on which site `i` receives, for all runs.
 
         The array has shape (P, runs, elements), for links from P peers.
         """

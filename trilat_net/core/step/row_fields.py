@@ -355,7 +355,7 @@ class SampleRow(Protocol):
     """A message from another arm, waiting for its simulated network delay to pass.
 
     The ring buffer of a link has one entry per control period of the receiver. Each entry holds
-    the newest message that will first be used in that period.
+    the newest of the messages that become due in that period.
     """
 
     tick: Annotated[int, Field("", "tick", "stamp of the sample; -1: no sample", "1 accept")]

@@ -22,7 +22,8 @@ class RunInputs(NamedTuple):
     """All external inputs of a recorded run, from which the run can be repeated.
 
     Attributes:
-        feed: Ticks in which samples of other sites arrived, and actions of live operators.
+        feed: Actions of live operators, and the ticks in which samples from other sites
+            arrived.
         changes: Changes of links or sites during the run, in chronological order. Each entry
             contains the tick before which the site applies the change, the index of the site,
             and the change.

@@ -245,7 +245,7 @@ class _SiteBuckets:
         self._put(topic, data, stamp_ns, log_ns)
 
     def add_record(self, record: Record, log_ns: int) -> None:
-        """Adds a record of the site, and writes the messages that this completes.
+        """Adds a record of the site, and writes the messages that are then complete.
 
         Records are collected in buckets, intervals of equal length. A bucket becomes two
         messages with the minimum and the maximum of each curve. To space the messages evenly,

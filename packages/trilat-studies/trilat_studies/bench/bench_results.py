@@ -205,7 +205,10 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of runs that were judged stable, excluding runs that were only settled."""
+        """Number of runs that were judged stable.
+
+        Runs that came to rest without being shown to be stable do not count.
+        """
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:

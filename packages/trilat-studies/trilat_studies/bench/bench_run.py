@@ -194,7 +194,7 @@ class JudgedRun(NamedTuple):
         """Repeats the run over a longer time if it was too short for a reliable verdict.
 
         A run is long enough if it is stable or settled and its arms are at rest at the end. Any
-        other run must last for `TIME_CONSTANTS` of its slowest time constants.
+        other run must last at least `TIME_CONSTANTS` times its slowest time constant.
 
         Returns:
             The longer run, or this run if it is long enough.

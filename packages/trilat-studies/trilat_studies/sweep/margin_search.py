@@ -431,9 +431,9 @@ class SweepMargins(Result):
     def table(self) -> TextTable:
         """Returns a table with one row per stability edge.
 
-        The columns are the values of the other swept parameters, the edge from runs, the edges
-        from the linear analysis and from a closed-form criterion, and the difference of each
-        theoretical edge from that of the runs. A grid point without an edge also has one row.
+        The columns are the values of the other swept parameters, the edges found by simulated
+        runs, by the linear analysis and by a closed-form criterion, and the deviation of each
+        theoretical edge from the simulated one. A grid point without an edge also has one row.
         """
         plan = self.plan
         several_seeds = len({point.seed for point in self.found}) > 1

@@ -299,8 +299,8 @@ _GAINS = {
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
     """Returns the label of an axis in a figure, such as "delay (ms)" for link.delay_ms.
 
-    If links draw their delays at random, the label says "stated delay": a newer sample may
-    overtake an older one, so the samples in use are younger than this delay suggests.
+    If link delays are random, the label says "stated delay": newer samples may overtake older
+    ones, so the samples in use are younger than the stated delay suggests.
 
     Args:
         key: Scenario key of the axis.

@@ -168,8 +168,8 @@ class SearchSpace(NamedTuple):
     """Gains of one control law that are tuned automatically, with their units and ranges.
 
     Attributes:
-        law: Name of the law. "known" stands for the law `adaptive` without adaptation, which
-            gets the true inertia of the arm.
+        law: Name of the law. "known" means the law `adaptive` with adaptation switched off and
+            the true inertia of the arm.
         knobs: Gains to search, with their units and ranges.
         known_facts: Information about the arm that the law gets, as text for tables.
         kind: Class of a built-in law. `None` for a user's law.
