@@ -101,7 +101,8 @@ def test_every_arm_stops_from_everywhere_and_returns(scenario: str, stage: Stage
         page.send(do="end")
         running.prints("checking the log")  # as `demo` does
     running.signal(signal.SIGINT)
-    assert running.code() == 130
+    # A compilation is ended by the signal itself, which a shell reports as 130 too.
+    assert running.code() in (130, -signal.SIGINT)
     assert_executed_again(open_log(stage.folder / "out" / "run.mcap"))
 
 
