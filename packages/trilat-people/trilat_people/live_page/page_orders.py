@@ -581,22 +581,28 @@ class OrderDesk:
         self.refused = refused
 
     def accept(
-        self, order: SiteOrder, sites: Collection[str], links: Collection[str], source: str = ""
+        self,
+        order: SiteOrder,
+        sites: Collection[str],
+        links: Collection[str],
+        first_site: str,
+        source: str = "",
     ) -> None:
         """Queues a page's request to change the session, move arms, or mark a moment.
 
         Args:
             order: The request.
-            sites: Names of the sites of the session. Marks are published by the first one.
+            sites: Names of the sites of the session, empty until all of them run.
             links: Names of the links of the session.
+            first_site: Site that publishes marks. Empty while the scenario is not yet known.
             source: Sender of the request, as recorded in log events.
         """
         if isinstance(order, _SetLink | _SetShares):
             self._queue_change(order, sites, links, source)
         elif isinstance(order, _ReleaseArms):
             self._release(order, sites, source)
-        elif sites:
-            self.mark(next(iter(sites)), order.text)
+        elif first_site:
+            self.mark(first_site, order.text)
 
     def _queue_change(
         self,

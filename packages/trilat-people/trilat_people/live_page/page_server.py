@@ -842,7 +842,9 @@ class PageServer:
         view = self.view
 
         if isinstance(message, SiteOrder):
-            self._desk.accept(message, view.sites, view.links, page.role.noun)
+            # Marks are accepted before all sites run.
+            first_site = "" if view.scenario is None else view.scenario.names[0]
+            self._desk.accept(message, view.sites, view.links, first_site, page.role.noun)
         elif isinstance(message, ShowAges):
             self._shows_ages = message.shown
         elif isinstance(message, MoveHand):
