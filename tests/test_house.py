@@ -48,7 +48,7 @@ MOST_WORDS = 8
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
 INTERFACE_LIMITS = {  # part: how many of its names other parts import
-    "kernel": 207,
+    "kernel": 208,
     "session": 189,
     "analysis": 59,
     "app": 50,

@@ -877,13 +877,8 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
         for peer, share in change.to.items():
             total_shares[site, scenario.names.index(peer)] += share
     # a share in either direction couples two sites
-    reachable = DominanceMatrix(total_shares + total_shares.T).reach
-    groups: list[list[int]] = []
-    for reachable_from_site in reachable:
-        group = np.flatnonzero(reachable_from_site).tolist()
-        if group not in groups:
-            groups.append(group)
-    return groups
+    coupling = DominanceMatrix(total_shares + total_shares.T)
+    return [list(group) for group in coupling.find_closed_groups()]
 
 
 def _find_disagreement(

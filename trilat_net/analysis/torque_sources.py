@@ -542,7 +542,7 @@ class WallEnergy(NamedTuple):
     arm_damping_n_s_m: float
 
     @staticmethod
-    def count_sampled_walls(scenario: Scenario) -> int:
+    def count_generating_walls(scenario: Scenario) -> int:
         """Returns the number of walls in a scenario that may generate energy.
 
         Args:

@@ -136,7 +136,7 @@ class FusedRun(CompiledRun):
         if scenario.external:
             arms = ", ".join(sorted(scenario.external))
             return f"the reaction of the external arm of {arms} is not known"
-        if scenario.inspect_user_laws() and not own_laws:
+        if scenario.user_laws and not own_laws:
             return "the imported control laws may not run (permit them with --law FILE)"
         if set(log.executed_sites) != set(log.sites):
             return "in a rerun, the sites whose records were copied did not react"

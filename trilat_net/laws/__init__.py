@@ -18,6 +18,7 @@ __all__ = [
     # Laws
     "PD",
     "Adaptive",
+    "complementary_shares",
     # The interface of a law
     "DAMPING",
     "ERROR_DAMPING",
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     )
     from .p_d import PD
     from .sent_vectors import SentVectorSpecs, convert_sends
+    from .six_channel import complementary_shares
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -74,5 +76,6 @@ else:
             ),
             "p_d": "PD",
             "sent_vectors": "SentVectorSpecs convert_sends",
+            "six_channel": "complementary_shares",
         },
     )

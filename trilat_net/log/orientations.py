@@ -157,12 +157,7 @@ class RotationVectors:
         quaternions = self.as_quaternions()
         w = quaternions[:, :1]
         v = quaternions[:, 1:]
-        sine = np.linalg.norm(v, axis=1, keepdims=True)
-        angle = 2.0 * np.arctan2(sine, w)
-        # The limit of angle / sine for small angles is 2.
-        limit = np.full_like(w, 2.0)
-        angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
-        return np.asarray(angle_by_sine * v)
+        return _to_rotation_vectors(w, v)
 
     def turns_from(self, references: Array) -> Array:
         """Computes the rotation vectors from reference orientations to these orientations.
@@ -189,13 +184,24 @@ class RotationVectors:
 
         # (w, p) and (-w, -p) are the same rotation. The one with w >= 0 is the shorter turn.
         p *= np.where(w < 0.0, -1.0, 1.0)
-        sine = np.linalg.norm(p, axis=1, keepdims=True)
-        angle = 2.0 * np.arctan2(sine, abs(w))
+        return _to_rotation_vectors(abs(w), p)
 
-        # The limit of angle / sine for small angles is 2.
-        limit = np.full_like(w, 2.0)
-        angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
-        return np.asarray(angle_by_sine * p)
+
+def _to_rotation_vectors(w: Array, v: Array) -> Array:
+    """Converts unit quaternions to rotation vectors, in rad.
+
+    The angle of the quaternion (w, v) is 2 atan2(|v|, w). Its axis is v.
+
+    Args:
+        w: Scalar parts, shape (K, 1).
+        v: Vector parts, shape (K, 3).
+    """
+    sine = np.linalg.norm(v, axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, w)
+    # The limit of angle / sine for small angles is 2.
+    limit = np.full_like(w, 2.0)
+    angle_by_sine = np.divide(angle, sine, out=limit, where=sine > 0.0)
+    return np.asarray(angle_by_sine * v)
 
 
 def expand_poses(x: Array) -> Array:

@@ -25,6 +25,7 @@ from .page_html import (
     render_facts,
     render_folds,
     render_note,
+    render_scrolling,
     render_section,
     render_table,
 )
@@ -132,7 +133,7 @@ def _lengthen_name(sentence: str) -> str:
 def _render_premises(certificate: Certificate) -> Markup:
     """Renders the table of the premises of the stability theorem."""
     table = render_macro("certificate.html", "premises", premises=certificate.premises)
-    return render_macro("parts.html", "scrolling", content=table, label="premises")
+    return render_scrolling(table, "premises")
 
 
 def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Figure]]:

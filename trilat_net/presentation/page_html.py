@@ -68,7 +68,7 @@ def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
 
     A table wider than the screen scrolls inside its own frame.
     """
-    return _render_scrolling(_render("facts", facts=facts), "facts")
+    return render_scrolling(_render("facts", facts=facts), "facts")
 
 
 def render_table(
@@ -86,10 +86,10 @@ def render_table(
             is always treated as text.
     """
     table = _render("table", columns=columns, rows=rows, text_columns=text_columns)
-    return _render_scrolling(table, next(iter(columns)))
+    return render_scrolling(table, next(iter(columns)))
 
 
-def _render_scrolling(content: Markup, label: str) -> Markup:
+def render_scrolling(content: Markup, label: str) -> Markup:
     """Renders wide content in a region that scrolls sideways, also with the keyboard.
 
     This keeps the page itself from becoming wider than the screen.

@@ -309,7 +309,7 @@ def _check_walls(log: Log) -> Premise | None:
     Returns:
         The premise. `None` if the scenario contains no such wall.
     """
-    if WallEnergy.count_sampled_walls(log.scenario) == 0:
+    if WallEnergy.count_generating_walls(log.scenario) == 0:
         return None
     quantities = WallQuantities(tuple(WallEnergy.list_of_log(log)))
     return Premise("walls", not quantities.active, quantities)

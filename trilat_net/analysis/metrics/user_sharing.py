@@ -17,7 +17,7 @@ import numpy as np
 
 from ...core import POSITION
 from ..aligned import AlignedRecords, find_common_rows
-from ..dominance_history import RAMP_TIME_TOLERANCE_S, DominancePlan
+from ..dominance_history import RAMP_TIME_TOLERANCE_S, DominanceHistory
 from ..run_view import RunView, SiteRun
 from ..shared_slave import SharedSlave, UserShares
 from .measures import (
@@ -218,8 +218,7 @@ def _measure_sharing(view: RunView, _run: str) -> MetricValues:
 
     records = view.sites[slave.name].records
     intervenes = shared.leader[records.known] != shared.program
-    ramps = DominancePlan.of_log(view.log, slave.name).ramps
-    ramp_spans_s = sorted((ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps)
+    ramp_spans_s = sorted(DominanceHistory.list_ramp_spans_s(view.log, slave.name))
 
     leader_changes = np.diff(shared.leader) != 0
     takeover_times_s = records.t_s[1:][leader_changes]

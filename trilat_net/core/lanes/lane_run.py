@@ -227,6 +227,23 @@ def _choose_code(layout: _LaneLayout) -> Callable[..., None]:
     return advance_site if layout.chain is None else advance_chain_site
 
 
+def _find_code(
+    layout: _LaneLayout,
+    structure: RunStructure,
+    site: SiteStructure,
+    clock: types.Type = types.int64,
+) -> LaneCode:
+    """Returns the code of one control period of a site. The arguments determine the types.
+
+    Args:
+        layout: Data types and lengths of the arrays.
+        structure: Structure of the run.
+        site: Structure of the site.
+        clock: Type of the tick and of its nominal time, see `_list_argument_types`.
+    """
+    return LaneCode(_choose_code(layout), _list_argument_types(layout, structure, site, clock))
+
+
 def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type) -> IntArray:
     """Returns the address of the compiled code that computes a tick, for each site.
 
@@ -242,11 +259,8 @@ def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type
         NumbaError: A user's law cannot be compiled for several runs at once.
     """
     layout = _find_layout(run)
-    addresses = []
-    for site in structure.sites:
-        arguments = _list_argument_types(layout, structure, site, clock)
-        addresses.append(LaneCode(_choose_code(layout), arguments).find_address())
-    return np.array(addresses)
+    codes = [_find_code(layout, structure, site, clock) for site in structure.sites]
+    return np.array([code.find_address() for code in codes])
 
 
 def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> str:
@@ -280,8 +294,7 @@ def read_assembly(run: CompiledRun, i: int) -> str:
     """
     structure = RunStructure.find(run)
     layout = _find_layout(run)
-    arguments = _list_argument_types(layout, structure, structure.sites[i])
-    return LaneCode(_choose_code(layout), arguments).read_assembly()
+    return _find_code(layout, structure, structure.sites[i]).read_assembly()
 
 
 @leaf
@@ -313,12 +326,7 @@ def has_lane_code(run: CompiledRun) -> bool:
     """
     structure = RunStructure.find(run)
     layout = _find_layout(run)
-    return all(
-        LaneCode(
-            _choose_code(layout), _list_argument_types(layout, structure, site)
-        ).is_stored()
-        for site in structure.sites
-    )
+    return all(_find_code(layout, structure, site).is_stored() for site in structure.sites)
 
 
 class _LinksOfRun:

@@ -505,7 +505,7 @@ class CompiledRun:
                 # After its last planned tick, a site has the next time `NEVER_NS`.
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
 
-        pairs = zip(ticks, self._progress["rate_hz"], strict=True)
+        pairs = zip(ticks, self.rates_hz, strict=True)
         longest_s = max(planned_ticks / rate_hz for planned_ticks, rate_hz in pairs)
         bucket_count = math.ceil(longest_s * BUCKETS_PER_S) + 1
         column_count = self._peaks.shape[2]

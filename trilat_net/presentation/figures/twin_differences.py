@@ -152,10 +152,12 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
         twins: The twins of `pushed`, each with its push and its difference from the run over
             time.
     """
-    log_amplitudes = pushed.measure_amplitudes(range(len(twins.joints)))
     joint_styles = _style_joints(pushed.log, twins.joints)
     shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(twins.paths)))
     has_several_sizes = pushed.linear is not None
+    log_amplitudes = []
+    if has_several_sizes or len(twins.paths) > 1:
+        log_amplitudes = pushed.measure_amplitudes(range(len(twins.joints)))
     for number, path in enumerate(twins.paths):
         # The name of a push is for example "1e-06 rad at m1 joint 1", "1e-06 rad at all joints"
         # or "1e-06 of all estimates". Only a push of joints has a target after "at".

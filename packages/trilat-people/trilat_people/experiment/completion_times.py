@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .statistics import CONFIDENCE, Row, correct_holm, read_number
+from .statistics import CONFIDENCE, Row, correct_holm, import_scipy_stats, read_number
 
 COMPLETION = "completion_s"
 """Name of the column with completion times."""
@@ -205,12 +205,9 @@ def _find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None
         Lower and upper end, in s. The upper end is `None` if it was not reached. The entire
         interval is `None` if there is no such rank, which is the case for fewer than six times.
     """
-    # imported late: the import takes half a second, and trials do not need it
-    from scipy import stats
-
     sorted_s = sorted(times_s)
     tail_probability = (1.0 - CONFIDENCE) / 2.0
-    binomial = stats.binom(len(sorted_s), 0.5)
+    binomial = import_scipy_stats().binom(len(sorted_s), 0.5)
     candidates = range(1, len(sorted_s) // 2 + 1)
     ranks = [rank for rank in candidates if float(binomial.cdf(rank - 1)) <= tail_probability]
     if not ranks:
@@ -266,16 +263,13 @@ def _compare(
         pairs: Medians of each unit under both conditions, in s; infinite if a median was not
             reached.
     """
-    # imported late: the import takes half a second, and trials do not need it
-    from scipy import stats
-
     longer = sum(second_s > first_s for first_s, second_s in pairs)
     shorter = sum(second_s < first_s for first_s, second_s in pairs)
     untied = longer + shorter
 
     p_value = None
     if untied > 1:  # a single unit cannot show a difference
-        p_value = float(stats.binomtest(longer, untied).pvalue)
+        p_value = float(import_scipy_stats().binomtest(longer, untied).pvalue)
 
     return CompletionComparison(
         first=first,

@@ -39,7 +39,7 @@ _ROUNDING = 1e-12
 """Spread, relative to the largest value, below which values are considered equal."""
 
 
-def _import_scipy_stats() -> Any:
+def import_scipy_stats() -> Any:
     """Imports `scipy.stats` on demand and returns the module.
 
     The import takes longer than all other imports of an experiment together, and is not needed
@@ -244,7 +244,7 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
         mean = float(sample.mean())
         return mean, mean
 
-    result = _import_scipy_stats().bootstrap(
+    result = import_scipy_stats().bootstrap(
         (sample,),
         np.mean,
         n_resamples=RESAMPLES,
@@ -360,7 +360,7 @@ def _compare(
     if are_equal:
         return untested._replace(difference=mean, interval=(mean, mean))
 
-    stats = _import_scipy_stats()
+    stats = import_scipy_stats()
     t_test = stats.ttest_rel(second_means, first_means)
     low, high = t_test.confidence_interval(CONFIDENCE)
 
@@ -596,7 +596,7 @@ def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
         condition: Name of the condition.
         freedom: Degrees of freedom of the t statistic.
     """
-    stats = _import_scipy_stats()
+    stats = import_scipy_stats()
     name = f"condition[T.{condition}]"  # of the effect, in statsmodels
     estimate = float(fit.fe_params[name])
     error = float(fit.bse_fe[name])
@@ -643,7 +643,7 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
             "give at least two units, and an alpha between 0 and 1"
         )
 
-    stats = _import_scipy_stats()
+    stats = import_scipy_stats()
     shift = abs(d_z) * math.sqrt(number)  # noncentrality of the t statistic
     freedom = number - 1
     critical_t = stats.t.ppf(1.0 - alpha / 2.0, freedom)

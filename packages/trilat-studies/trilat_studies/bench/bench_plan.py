@@ -30,6 +30,7 @@ import msgspec
 
 from trilat_net.errors import UsageError, suggest_nearest
 from trilat_net.files import write_whole
+from trilat_net.laws import complementary_shares
 from trilat_net.scenario import BUILT_IN, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
 from trilat_net.work import Progress, Workers, ignore_progress
 
@@ -107,14 +108,12 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
     Returns:
         The nonzero factors, by the name of the arm and by the name of the arm that it follows.
     """
-    factors_by_arm = {
-        "m1": {"m2": 1.0 - a, "s": a},
-        "m2": {"m1": a, "s": 1.0 - a},
-        "s": {"m1": a, "m2": 1.0 - a},
-    }
+    names = ("m1", "m2", "s")
+    matrix = complementary_shares(a).tolist()
     dominance = {}
-    for name, factors in factors_by_arm.items():
-        dominance[name] = {peer: factor for peer, factor in factors.items() if factor}
+    for name, factors in zip(names, matrix, strict=True):
+        factors_by_peer = zip(names, factors, strict=True)
+        dominance[name] = {peer: factor for peer, factor in factors_by_peer if factor}
     return dominance
 
 

@@ -415,8 +415,8 @@ class SweepMargins(Result):
         # The workers need the files of control laws that users wrote.
         laws = plan.base.imported_code
         with WorkerPool.open(jobs, on, most=len(searches), laws=laws) as pool:
-            found = pool.map(_search_margin_task, searches, progress)
-        return cls(plan, within, found)
+            points = pool.map(_search_margin_task, searches, progress)
+        return cls(plan, within, points)
 
     @property
     def command(self) -> str:

@@ -158,9 +158,9 @@ class TuningReport:
                 shown, including the first and the last one. If `None`, all points are shown.
         """
         count = len(search.front)
-        shown = count if most is None else min(most, count)
+        row_count = count if most is None else min(most, count)
         # evenly spread, including the first and the last point
-        row_indices = {round(place) for place in np.linspace(0, count - 1, shown)}
+        row_indices = {round(index) for index in np.linspace(0, count - 1, row_count)}
         overall_front = self._tuned.list_overall_front(search)
         tuned_gains = search.space.knobs
 
