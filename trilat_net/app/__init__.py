@@ -25,8 +25,6 @@ __all__ = [
     "ShareHistory",
     "StatusRow",
     "compile_core",
-    "open_hand",
-    "ping_session",
     "run_demo",
     # Input devices
     "Device",
@@ -43,8 +41,8 @@ if TYPE_CHECKING:
     from .demo_session import SessionResult, compile_core, run_demo
     from .input_device import Device, DeviceState, Vector
     from .monitor import SessionDisplay, StatusRow
-    from .running_session import RunningSession, ShareHistory, open_hand
-    from .session_ping import ping_session
+    from .running_session import RunningSession
+    from .share_history import ShareHistory
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -56,7 +54,7 @@ else:
             "demo_session": "SessionResult compile_core run_demo",
             "input_device": "Device DeviceState Vector",
             "monitor": "SessionDisplay StatusRow",
-            "running_session": "RunningSession ShareHistory open_hand",
-            "session_ping": "ping_session",
+            "running_session": "RunningSession",
+            "share_history": "ShareHistory",
         },
     )

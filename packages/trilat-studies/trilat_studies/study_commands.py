@@ -476,17 +476,7 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
     if not names_session:
         return text
 
-    from trilat_net.app import ping_session
-
-    measurement = ping_session(
-        connection=reach.resolve(operates=False),
-        clock=SystemClock(),
-        session=options.check_session_name(name),
-        count=50,
-        timeout_s=3.0,
-        stopped=lambda: False,
-    )
-    assert measurement is not None  # nothing stops the measurement
+    measurement = reach.open_session(name, operates=False).ping()
     one_way_us = [
         0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
     ]
