@@ -13,7 +13,6 @@ __all__ = [
     "options",
     "run_and_report",
     "seconds",
-    "show_progress",
     "value",
     # The Python interface
     "AnyScenario",
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from .api import AnyScenario, Overrides
     from .cli import options
     from .cli.options import seconds, value
-    from .cli.run_progress import show_progress
     from .cli.sessions import run_and_report
     from .demo_session import SessionResult, compile_core, run_demo
     from .input_device import Device, DeviceState, Vector
@@ -49,7 +47,6 @@ else:
         {
             "api": "AnyScenario Overrides",
             "cli.options": "options seconds value",
-            "cli.run_progress": "show_progress",
             "cli.sessions": "run_and_report",
             "demo_session": "SessionResult compile_core run_demo",
             "input_device": "Device DeviceState Vector",

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import options, show_progress, value
+from trilat_net.app import options, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time
 from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
@@ -525,7 +525,7 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
         if selected_laws:
             selected_by_form[form] = selected_laws
 
-    with show_progress("tuning", terminal.print_note) as progress:
+    with terminal.show_progress("tuning", terminal.print_note) as progress:
         tune_laws(
             selected_by_form,
             jobs,
@@ -551,7 +551,7 @@ def _run_bench(
     from .bench import run_bench
 
     try:
-        with show_progress("running", terminal.print_note) as progress:
+        with terminal.show_progress("running", terminal.print_note) as progress:
             return run_bench(folder, jobs, on, progress, confirm=confirm)
     except KeyboardInterrupt:
         terminal.print_note(
