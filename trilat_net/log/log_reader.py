@@ -42,7 +42,6 @@ from ..errors import (
     count_nouns,
     suggest_nearest,
 )
-from ..files import describe_missing_library
 from ..hooks import find_hook
 from ..net import (
     READABLE,
@@ -54,6 +53,7 @@ from ..net import (
     topics,
 )
 from ..own_code import LawFiles, allow_logged_code
+from ..package_names import describe_missing_library
 from ..records import NS_PER_S
 from ..results import Result
 from ..scenario import (
