@@ -176,11 +176,11 @@ def record_command(
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder import record_session
-    from sites import check_machine_load
 
     from ...files import refuse_existing
     from ...log import ChannelFilter, LogStorage, collect_provenance
     from ...net import RECORDER
+    from ..machine_load import check_machine_load
     from ..recorded_session import make_scenario_reader
     from .options import parse_viz_rate
 
