@@ -30,9 +30,9 @@ from itertools import islice
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from ..errors import RunFailed, UsageError
-from ..files import require_libraries
 from ..net import SystemClock
 from ..own_code import CodeConsents, allowed_code, allowing_any_settings
+from ..package_names import require_libraries
 from ..workers import count_cores, worker_pool
 from .dask_cluster import DaskCluster, WorkerRequirements
 

@@ -44,7 +44,7 @@ from scipy.optimize import brentq
 
 from trilat_net.analysis import EnvelopeFit, EnvelopeTrend, RestingLoop
 from trilat_net.core import BUCKETS_PER_S, Array
-from trilat_net.errors import UsageError
+from trilat_net.errors import LogError, UsageError
 from trilat_net.execution import FusedRun
 from trilat_net.log import open_log
 from trilat_net.presentation import MARKS, Block, MarkedText, TextTable, describe_moving_states
@@ -278,8 +278,12 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
 
     medians_ms = {}
     log = open_log(path)
+    try:
+        link_delays = log.link_delays
+    except LogError as error:
+        raise UsageError(f"--delay {text}: {str(error).removeprefix(f'{path}: ')}") from None
     for name in log.scenario.links:
-        delays = log.link_delays[name]
+        delays = link_delays[name]
         if not delays:
             raise UsageError(f"--delay {text}: no sample arrived over {name}")
         medians_ms[name] = float(np.median([delay_ms for _, delay_ms in delays]))

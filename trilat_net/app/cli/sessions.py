@@ -94,7 +94,8 @@ def run_and_report(
     """
     from trilat_net.app.demo_session import run_demo
 
-    from ...files import make_results_folder, require_libraries
+    from ...files import make_results_folder
+    from ...package_names import require_libraries
 
     require_libraries()
     results = make_results_folder(run.folder, chosen.name, force=run.force)

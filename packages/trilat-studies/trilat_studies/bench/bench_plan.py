@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from trilat_net.core import DominanceMatrix
 from trilat_net.errors import UsageError, suggest_nearest
 from trilat_net.files import write_whole
-from trilat_net.laws import complementary_shares
 from trilat_net.scenario import BUILT_IN, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
 from trilat_net.work import Progress, Workers
 
@@ -109,7 +109,7 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
         The nonzero factors, by the name of the arm and by the name of the arm that it follows.
     """
     names = ("m1", "m2", "s")
-    matrix = complementary_shares(a).tolist()
+    matrix = DominanceMatrix.complementary(a).alpha.tolist()
     dominance = {}
     for name, factors in zip(names, matrix, strict=True):
         factors_by_peer = zip(names, factors, strict=True)
