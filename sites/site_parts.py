@@ -252,7 +252,7 @@ class SiteParts:
             return
 
         own_hand = HandSite.find(self.scenario, name)
-        if own_hand is not None and not own_hand.has_separate_process:
+        if own_hand is not None and not self.scenario.sites[name].needs_hand_process:
             run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
             self.hand = HandPlayer(own_hand, own_hand.make_program(), run_hand)
             return

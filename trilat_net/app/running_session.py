@@ -46,7 +46,7 @@ from ..net import (
     connect_to_session,
     read_messages,
 )
-from ..scenario import PictureDelay, parse_core_change
+from ..scenario import PictureDelay
 from .input_device import Device
 from .session_ping import PingReport, ping_session
 
@@ -102,7 +102,7 @@ class ShareHistory:
             change: Description of the change, from the field `command` of the event.
         """
         with suppress(ScenarioError):  # raised if the text is not a change
-            ramp = parse_core_change(self._scenario, self._site, change).ramp
+            ramp = self._scenario.parse_core_change(self._site, change).ramp
             # A ramp that starts before the present ramp was added earlier, from another event.
             if ramp is not None and ramp.start_ns >= self._ramp.start_ns:
                 self._later_ramps.append(ramp)
@@ -292,19 +292,12 @@ class RunningSession:
                 repeats=False,
             ) as hand,
         ):
-            live = scenario.sites[site].find_live_hand(is_open=True)
-            if live is None or live.mode != "tip":
-                raise UsageError(
-                    "a device can lead only an end effector: "
-                    f"the hand of {site} must have the mode 'tip'"
-                )
-
             device_hand = make_device_hand(
                 hand=hand,
                 device=device,
-                operator=live,
+                scenario=scenario,
+                site=site,
                 clock=self._clock,
-                reach=scenario.arms[site].reach,
             )
             device_hand.run(stopped, lambda text: say(f"{site}: {text}"))
             say(f"{site}: {device_hand.describe()}")

@@ -39,7 +39,6 @@ from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive
 from trilat_net.scenario import (
     LinkBase,
     Scenario,
-    SiteSpec,
     is_number,
 )
 from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
@@ -658,7 +657,7 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     K = []
     d = []
     for spec in scenario.sites.values():
-        gains = _find_scalar_gains(spec)
+        gains = _find_scalar_gains(spec.control)
         if gains is None:
             return None
         K.append(gains[0])
@@ -708,16 +707,18 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
 _DAMPING_SOURCE = "P+d: sufficient for arms of any mass, and necessary for the worst masses"
 
 
-def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
+def _find_scalar_gains(law: Any) -> tuple[float, float] | None:
     """Returns the gains K and d of a site's P+d law, if they are the same for all joints.
 
     The criteria do not cover different gains, because the arm couples its joints.
+
+    Args:
+        law: Control law of the site.
 
     Returns:
         K in N m/rad and d in N m s/rad. `None` if the site has another law, no full gravity
         compensation, or joints with different gains.
     """
-    law: Any = spec.control
     if law.kind is not PD or law.gravity != 1.0:
         return None
     distinct_K = {*law.K}
