@@ -80,7 +80,6 @@ if TYPE_CHECKING:
         ScenarioDifference,
         describe_law,
         describe_scenario,
-        describe_value,
         flatten_table,
     )
     from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect
@@ -105,6 +104,7 @@ if TYPE_CHECKING:
     from .scenario_types import Scenario
     from .simulated_arm import SimulatedArm
     from .skeletons import name_skeleton_class, new_hand, new_law, new_plant
+    from .value_text import describe_value
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -115,7 +115,7 @@ else:
             "delay_traces": "TracePoint import_trace",
             "describe": (
                 "IRREVERSIBLE_SHARES ScenarioDifference describe_law describe_scenario "
-                "describe_value flatten_table"
+                "flatten_table"
             ),
             "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect",
             "key_checks": "check_finite is_distribution is_number",
@@ -135,5 +135,6 @@ else:
             "scenario_types": "Scenario",
             "simulated_arm": "SimulatedArm",
             "skeletons": "name_skeleton_class new_hand new_law new_plant",
+            "value_text": "describe_value",
         },
     )

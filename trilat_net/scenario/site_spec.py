@@ -27,6 +27,7 @@ from .operators import Environment, Operator
 from .operators.kernel_operators import LiveHand
 from .operators.program_hand import ProgramHand
 from .own_plant import OwnPlant
+from .value_text import describe_value
 
 _OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad")
 """Optional limits that become mandatory for a real robot."""
@@ -224,6 +225,22 @@ class SiteSpec(Frozen, frozen=True):
     def user_law(self) -> ImportedLaw | None:
         """Control law of the site if it is a user's Python class; None if it is built in."""
         return self.control if isinstance(self.control, ImportedLaw) else None
+
+    def describe_gains(self, *, with_defaults: bool = False) -> dict[str, str]:
+        """Returns the gains of the control law as short strings for users, such as "10" for K.
+
+        The gains of a user's law are the arguments of its class.
+
+        Args:
+            with_defaults: If True, arguments that the scenario leaves to the class of a user's
+                law are included.
+        """
+        gains = msgspec.structs.asdict(self.control)
+        if self.user_law is not None:
+            gains = self.user_law.settings
+            if with_defaults:
+                gains = self.user_law.read_default_settings() | gains
+        return {key: describe_value(value) for key, value in gains.items()}
 
     @property
     def has_program_hand(self) -> bool:
