@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core import Array, LinkSetup, RestGains, Scheme, SiteSetup, link_key
+from ..core import Array, LinkSetup, RestGains, SiteSetup, link_key
 from .delay_models import LinkBase
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def build_site_setup(scenario: "Scenario", site: str) -> SiteSetup:
     return SiteSetup(
         name=site,
         rate_hz=spec.rate_hz,
-        scheme=Scheme[scenario.scheme.upper()],
+        digital=scenario.scheme == "digital",
         gains=scenario.gains(site),
         theta=arm.theta,
         g_m_s2=spec.arm.g_m_s2,
