@@ -41,7 +41,7 @@ from trilat_net.scenario import (
     Scenario,
     is_number,
 )
-from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
+from trilat_net.work import Progress, WorkerPool, Workers
 
 from ..run_commands import format_override_value
 from .fixed_gains import describe_fixed_gains
@@ -1243,7 +1243,7 @@ class StabilityMap(NamedTuple):
         results: SweepResults,
         commands: tuple[str, ...],
         jobs: int | None = None,
-        progress: Progress = ignore_progress,
+        progress: Progress | None = None,
         *,
         linearly: bool = True,
         on: Workers = None,
