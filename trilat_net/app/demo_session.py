@@ -238,7 +238,7 @@ class ProcessStarter:
     ) -> None:
         """Sends a request to the starter: a start if `number` is 0, otherwise a signal.
 
-        The starter is the process that starts the processes of the session as its copies.
+        The starter creates the processes of the session as forks of itself.
 
         Args:
             name: Name of the process.
@@ -489,7 +489,8 @@ def _start(
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
     """Returns True if the session is over: a process has failed, or all processes have ended.
 
-    If one process fails, the others are not left running.
+    After the failure of one process, the session ends, so that the other processes do not keep
+    running.
 
     Args:
         children: The processes.
