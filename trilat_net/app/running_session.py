@@ -218,19 +218,12 @@ class RunningSession:
                 bus, site, scenario, source=type(device).__name__, repeats=False
             ) as hand,
         ):
-            live = scenario.sites[site].find_live_hand(is_open=True)
-            if live is None or live.mode != "tip":
-                raise UsageError(
-                    "a device can lead only an end effector: "
-                    f"the hand of {site} must have the mode 'tip'"
-                )
-
             device_hand = make_device_hand(
                 hand=hand,
                 device=device,
-                operator=live,
+                scenario=scenario,
+                site=site,
                 clock=self._clock,
-                reach=scenario.arms[site].reach,
             )
             device_hand.run(stopped, lambda text: say(f"{site}: {text}"))
             say(f"{site}: {device_hand.describe()}")

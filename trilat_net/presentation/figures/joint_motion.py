@@ -793,7 +793,7 @@ def _list_sites_with_walls(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
-    return [site for site in log.sites if VirtualWall.list_of_site(log.scenario.sites[site])]
+    return [site for site in log.sites if VirtualWall.list_of_site(log.scenario, site)]
 
 
 @draws(
@@ -818,7 +818,7 @@ def _draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             records = log[site]
             arm_rows = build_arm_rows(log.scenario, site)
             end_effector = arm_rows.place_end_effector(records.q, records.qd)
-            walls = VirtualWall.list_of_site(log.scenario.sites[site])
+            walls = VirtualWall.list_of_site(log.scenario, site)
             for wall_number, wall in enumerate(walls):
                 dashes = style.DASHES[wall_number % len(style.DASHES)]
                 force_n = wall.find_force(records.t_s, end_effector)
