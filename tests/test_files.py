@@ -19,7 +19,7 @@ from tests.install_extras import list_extras, parse_extras
 from tests.other_systems import replace_os
 from trilat_net import files
 from trilat_net.app.api import choose_report_folder
-from trilat_net.app.demo_session import create_file
+from trilat_net.app.process_starter import create_file
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import (
     Extra,

@@ -14,7 +14,7 @@ from tests.cli.running import trilat
 from tests.live.processes import is_running
 from tests.net.waiting import until
 from trilat_net.app import demo_session
-from trilat_net.app.demo_session import ProcessStarter, SessionProcess
+from trilat_net.app.process_starter import ProcessStarter, SessionProcess
 from trilat_net.core.step.jit import COMPILING, compiling_notice
 from trilat_net.core.step.kernel import site_tick
 from trilat_net.scenario import load_scenario

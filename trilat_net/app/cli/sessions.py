@@ -23,6 +23,7 @@ from .options import flag, value
 
 if TYPE_CHECKING:
     from ...scenario import Scenario
+    from ..running_session import RunningSession
 
 
 @options.command("paper --duration 10 --set control.Kd=5")
@@ -540,9 +541,8 @@ def set_command(
     Without endpoints, the command connects to the first site's loopback port and asks it for
     the other sites.
     """
-    name = None if session is None else options.check_session_name(session)
-    # Typer runs this function first, and then the command of the group, which needs both.
-    context.obj = name, reach.resolve()
+    # Typer runs this function first, and then the command of the group, which uses the session.
+    context.obj = None if session is None else reach.open_session(session)
 
 
 @options.command("'m1->s' --delay 350ms --loss 5%", page="docs/reference/links.md")
@@ -615,25 +615,22 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     """Requests a change, such as another delay, from a running arm, and prints the reply.
 
     Args:
-        context: The command line. `set_command` has stored the session and the connection in
-            it.
+        context: The command line. `set_command` has stored the session in it, or `None`.
         site: Name of the site.
         change: Fields of a `ChangeRequest`.
 
     Raises:
         UsageError: The session is not named, or the site rejects the change.
     """
-    from trilat_net.app.running_session import RunningSession
-
     from ...net import ChangeRequest
     from ...scenario import check_finite
 
-    session, connection = context.obj
+    running: RunningSession | None = context.obj
     check_finite(change, "")  # messages cannot hold infinite numbers
-    if session is None:
+    if running is None:
         raise UsageError("the session is not named: use trilat set --session ID ...")
 
-    reply = RunningSession(session, connection).change(site, ChangeRequest(**change))
+    reply = running.change(site, ChangeRequest(**change))
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
 
