@@ -48,10 +48,10 @@ from ..log import (
     Progress,
     RecordsByTick,
     SiteLog,
+    count_skipped_ticks,
     open_log,
 )
 from ..net import MODE_WORDS, STATE_VECTORS, State
-from ..recorded_change import count_skipped_ticks
 from ..records import TickRecord
 from ..scenario import parse_core_change
 from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable
