@@ -25,7 +25,6 @@ __all__ = [
     "ShareHistory",
     "StatusRow",
     "compile_core",
-    "open_hand",
     "ping_session",
     "run_demo",
     # Input devices
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from .demo_session import SessionResult, compile_core, run_demo
     from .input_device import Device, DeviceState, Vector
     from .monitor import SessionDisplay, StatusRow
-    from .running_session import RunningSession, ShareHistory, open_hand
+    from .running_session import RunningSession, ShareHistory
     from .session_ping import ping_session
 else:
     __getattr__ = import_on_use(
@@ -56,7 +55,7 @@ else:
             "demo_session": "SessionResult compile_core run_demo",
             "input_device": "Device DeviceState Vector",
             "monitor": "SessionDisplay StatusRow",
-            "running_session": "RunningSession ShareHistory open_hand",
+            "running_session": "RunningSession ShareHistory",
             "session_ping": "ping_session",
         },
     )

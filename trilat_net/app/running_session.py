@@ -253,6 +253,46 @@ class RunningSession:
             scenario = parse_embedded(info.scenario, self.name)
             yield bus, scenario
 
+    def open_hand(
+        self, bus: Bus, scenario: Scenario, site: str, source: str = "", *, repeats: bool = True
+    ) -> Hand:
+        """Opens a connection through which a program moves an arm of the session.
+
+        The program takes the place of the person who would otherwise hold the arm.
+
+        Args:
+            bus: Network connection that reaches the site.
+            scenario: Scenario of the session.
+            site: Site of the arm.
+            source: Name of the program or person, used in events of the session.
+            repeats: True to repeat the last message regularly from a thread, which shows the
+                site that the program is still running; see `Hand`.
+
+        Raises:
+            UsageError: The scenario does not allow a live operator at that arm.
+        """
+        scenario.find_site(site)
+        live = scenario.sites[site].find_live_hand(is_open=True)
+        if live is None:
+            open_sites = ", ".join(scenario.open_hands)
+            remedy = f"; the sites with such an operator are {open_sites}" if open_sites else ""
+            raise UsageError(
+                f"nobody can move the arm of {site}: "
+                f"the scenario has no operator of kind 'live' at this site{remedy}"
+            )
+
+        compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector
+        return Hand(
+            bus=bus,
+            clock=self._clock,
+            session=self.name,
+            site=site,
+            operator=live.actor,
+            compute_pose=compute_pose,
+            source=source,
+            repeats=repeats,
+        )
+
     def lead(
         self,
         site: str,
@@ -282,15 +322,7 @@ class RunningSession:
         make_device_hand = load_entry(HOOKS, "device-hand", "RunningSession.lead")
         with (
             self.reach_site(site, timeout_s) as (bus, scenario),
-            open_hand(
-                bus=bus,
-                clock=self._clock,
-                session=self.name,
-                site=site,
-                scenario=scenario,
-                source=type(device).__name__,
-                repeats=False,
-            ) as hand,
+            self.open_hand(bus, scenario, site, type(device).__name__, repeats=False) as hand,
         ):
             live = scenario.sites[site].find_live_hand(is_open=True)
             if live is None or live.mode != "tip":
@@ -904,68 +936,12 @@ def hand(
             cannot be used.
     """
     connection = Connection.of_member(None, connect, router).secure(keys, insecure=False)
+    running = RunningSession(session, connection)
     with (
-        RunningSession(session, connection).reach_site(site, timeout_s) as (bus, scenario),
-        open_hand(
-            bus=bus,
-            clock=SystemClock(),
-            session=session,
-            site=site,
-            scenario=scenario,
-            source=source,
-        ) as port,
+        running.reach_site(site, timeout_s) as (bus, scenario),
+        running.open_hand(bus, scenario, site, source) as port,
     ):
         yield port
-
-
-def open_hand(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    site: str,
-    scenario: Scenario,
-    source: str = "",
-    *,
-    repeats: bool = True,
-) -> Hand:
-    """Opens a connection through which a program moves an arm of a running session.
-
-    The program takes the place of the person who would otherwise hold the arm.
-
-    Args:
-        bus: Network connection that reaches the site.
-        clock: Clock of this process.
-        session: Name of the session.
-        site: Site of the arm.
-        scenario: Scenario of the session.
-        source: Name of the program or person, used in events of the session.
-        repeats: True to repeat the last message regularly from a thread, which shows the site
-            that the program is still running; see `Hand`.
-
-    Raises:
-        UsageError: The scenario does not allow a live operator at that arm.
-    """
-    scenario.find_site(site)
-    live = scenario.sites[site].find_live_hand(is_open=True)
-    if live is None:
-        open_sites = ", ".join(scenario.open_hands)
-        remedy = f"; the sites with such an operator are {open_sites}" if open_sites else ""
-        raise UsageError(
-            f"nobody can move the arm of {site}: "
-            f"the scenario has no operator of kind 'live' at this site{remedy}"
-        )
-
-    compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector
-    return Hand(
-        bus=bus,
-        clock=clock,
-        session=session,
-        site=site,
-        operator=live.actor,
-        compute_pose=compute_pose,
-        source=source,
-        repeats=repeats,
-    )
 
 
 def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
