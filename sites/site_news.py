@@ -15,8 +15,6 @@ import numpy as np
 
 from trilat_net.core import (
     LifeAlarm,
-    LifeReason,
-    StaleAction,
     describe_mode,
     tick_ns,
 )
@@ -87,7 +85,7 @@ class SiteNews:
             text = describe_mode(
                 parts.name,
                 output,
-                glides=parts.setup.on_stale.action is StaleAction.GLIDE,
+                glides=parts.setup.on_stale.glides,
                 law_failure=parts.site.law_failure,
             )
             self._publisher.publish("mode", text, t_ns=output.t_ns, ticks=output.tick)
@@ -112,7 +110,7 @@ class SiteNews:
                 return
             self._alarm_s = second
 
-        if rule.action is not StaleAction.GLIDE:
+        if not rule.glides:
             return
 
         # Some arms continue without a lost peer. For them, an alarm is raised when they return
@@ -199,12 +197,11 @@ class SiteNews:
         """
         if output.mode not in (Mode.WAITING, Mode.HOLD):
             return
-        if self._parts.setup.on_stale.action is not StaleAction.GLIDE:
+        if not self._parts.setup.on_stale.glides:
             return
 
         second = output.t_ns // NS_PER_S
-        is_too_far = self._parts.site.life_reason is LifeReason.ALIGN_LIMIT
-        if is_too_far and second > self._waiting_s:
+        if self._parts.site.is_too_far and second > self._waiting_s:
             self._waiting_s = second
             text = describe_mode(self._parts.name, output, glides=True)
             self._publisher.publish("waiting", text, t_ns=output.t_ns, ticks=output.tick)

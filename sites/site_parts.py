@@ -16,12 +16,10 @@ from typing import Any
 
 from trilat_net.core import (
     CoreChange,
-    DelayKind,
     PlantState,
     Site,
     SiteSetup,
     TickInput,
-    first_tick_at,
     tick_ns,
 )
 from trilat_net.errors import LawFailed, WireError
@@ -252,7 +250,7 @@ class SiteParts:
             return
 
         own_hand = HandSite.find(self.scenario, name)
-        if own_hand is not None and not own_hand.has_separate_process:
+        if own_hand is not None and not self.scenario.sites[name].needs_hand_process:
             run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
             self.hand = HandPlayer(own_hand, own_hand.make_program(), run_hand)
             return
@@ -355,7 +353,7 @@ class SiteParts:
         mode = self.site.mode
         orders: list[SiteOrder] = [self.arm.pop_order(mode)]
         if self.switch is not None:
-            orders.append(self.switch.pop_order(mode, self.site.life_reason))
+            orders.append(self.switch.pop_order(self.site))
         changes += [self._make_order_change(tick, order) for order in orders if order]
         return changes
 
@@ -403,12 +401,7 @@ def _may_hold_samples(scenario: Scenario, name: str) -> bool:
                 continue
             # The models replace each other in the course of the run.
             for model in link.models:
-                is_constant = model.kind == DelayKind.CONSTANT
-                # A random delay may be as short as 0.
-                smallest_network_us = model.location if is_constant else 0.0
-                # The play-out buffer holds each sample until it has at least a given age.
-                smallest_delay_us = max(model.playout_us, smallest_network_us)
-                if smallest_delay_us < _MIN_HELD_DELAY_US:
+                if model.least_us < _MIN_HELD_DELAY_US:
                     return False
     return True
 
@@ -488,7 +481,7 @@ def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickR
         site: The site in the simulation kernel.
         step: Function that computes a tick of the site.
     """
-    site.start_at(first_tick_at(0, site.rate_hz))
+    site.start_at(0)
     site.release_tick(0, 0)  # as when a site joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None

@@ -21,12 +21,10 @@ from tests.log.builders import make_log_bytes, write_log
 from tests.net.waiting import sleep_for_ns, until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reach_session
-from trilat_net.app.running_session import RunningSession
+from tests.sites.sessions import Session, reach_session
 from trilat_net.log.ros2.topic_names import TopicTable
 from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
-from trilat_net.net.connection import Connection
 from trilat_net.scenario import load_scenario
 
 LOOK = Path(__file__).parents[1] / "examples" / "look_into_a_log.py"
@@ -297,12 +295,8 @@ def test_programs_hand_over_without_a_step(
         running = reach_session(bus, clock)
         wait_s(1.0)
         with (
-            RunningSession(SESSION, Connection(), bus, clock).open_hand(
-                bus, scenario, "m2"
-            ) as program,
-            RunningSession(SESSION, Connection(), bus, clock).open_hand(
-                bus, scenario, "m1"
-            ) as person,
+            running.open_hand(bus, "m2", scenario) as program,
+            running.open_hand(bus, "m1", scenario) as person,
         ):
             moved = example["lead"](
                 running, program, person, 9.0, lambda: 1e-9 * clock.monotonic_ns(), wait_s
@@ -329,12 +323,8 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
 
         with (
             reach_session(bus, clock) as running,
-            RunningSession(SESSION, Connection(), bus, clock).open_hand(
-                bus, scenario, "m1"
-            ) as hand,
-            RunningSession(SESSION, Connection(), bus, clock).open_hand(
-                bus, scenario, "m2"
-            ) as follower,
+            running.open_hand(bus, "m1", scenario) as hand,
+            running.open_hand(bus, "m2", scenario) as follower,
         ):
             for seconds in (4.0, 0.04):
                 outcomes.extend(

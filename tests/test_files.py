@@ -33,7 +33,7 @@ from trilat_net.files import (
 from trilat_net.log.log_file import LogFile, sync_folder
 from trilat_net.package_names import EXTRAS, STUDY_LIBRARIES, describe_missing_library
 from trilat_net.presentation.export import EXPORT_MANIFEST
-from trilat_net.work.study_folder import RunJournal
+from trilat_net.work.run_journal import RunJournal
 
 
 def read_folder(folder: Path) -> dict[str, str]:

@@ -124,13 +124,7 @@ if TYPE_CHECKING:
     from .timeline import Timeline
     from .torque_sources import SourceRows, TorqueSplit, VirtualWall
     from .twins.envelope_trend import EnvelopeFit, EnvelopeTrend
-    from .twins.twin_growth import (
-        MOST_LOG,
-        PushedTwins,
-        PushGrowth,
-        TwinGrowth,
-        twin,
-    )
+    from .twins.twin_growth import MOST_LOG, PushedTwins, PushGrowth, TwinGrowth, twin
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -169,6 +163,6 @@ else:
             "timeline": "Timeline",
             "torque_sources": "SourceRows TorqueSplit VirtualWall",
             "twins.envelope_trend": "EnvelopeFit EnvelopeTrend",
-            "twins.twin_growth": ("MOST_LOG PushGrowth PushedTwins TwinGrowth twin"),
+            "twins.twin_growth": "MOST_LOG PushGrowth PushedTwins TwinGrowth twin",
         },
     )

@@ -720,7 +720,7 @@ def _find_coasting_joints(
     site_specs = [scenario.sites[scenario.names[site]] for site in group]
     free_laws = []
     for spec in site_specs:
-        actors = [source.actor for source in (*spec.hands, *spec.environment)]
+        actors = spec.actors
         if not any(actor.start_s <= end_s < actor.end_s for actor in actors):
             free_laws.append(spec.control)
 
@@ -878,7 +878,7 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
             total_shares[site, scenario.names.index(peer)] += share
     # a share in either direction couples two sites
     coupling = DominanceMatrix(total_shares + total_shares.T)
-    return [list(group) for group in coupling.find_closed_groups()]
+    return [list(group) for group in coupling.closed_groups]
 
 
 def _find_disagreement(

@@ -28,14 +28,15 @@ from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, 
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from multiprocessing.connection import Connection, Pipe
+from multiprocessing.connection import Connection as PipeEnd
+from multiprocessing.connection import Pipe
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from rich.console import Console
 from setproctitle import setproctitle
 
-from sites import check_machine_load, warm_up
+from sites import warm_up
 from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
@@ -46,9 +47,9 @@ from trilat_net.signals import Interrupt
 from ..core import compiling_notice, is_core_cached
 from ..files import refuse_link
 from ..log import Log, open_log
-from ..net import Clock, DefaultEndpoints, SystemClock, ZenohBus
+from ..net import Clock, Connection, DefaultEndpoints, SystemClock
 from ..records import NS_PER_S
-from ..scenario import HandSite, check_outside_arms
+from .machine_load import check_machine_load
 from .monitor import SessionDisplay, SessionMonitor
 
 POLL_NS = 100_000_000
@@ -237,7 +238,7 @@ class ProcessStarter:
     ) -> None:
         """Sends a request to the starter: a start if `number` is 0, otherwise a signal.
 
-        The starter is the process that starts the processes of the session as its copies.
+        The starter creates the processes of the session as forks of itself.
 
         Args:
             name: Name of the process.
@@ -323,8 +324,8 @@ def run_demo(
         UsageError: The scenario has an operator that runs as a separate program, and the
             package trilat-people is missing.
     """
-    check_outside_arms(scenario)
-    if any(_needs_hand_process(scenario, name) for name in scenario.names):
+    scenario.check_outside_arms()
+    if any(spec.needs_hand_process for spec in scenario.sites.values()):
         # A missing package is reported now, and not by a process in the middle of the start.
         load_entry(COMMANDS, "hand", "trilat hand")
     result = SessionResult(folder / "run.mcap")
@@ -361,7 +362,7 @@ def run_demo(
         if attend is not None:
             attending = attend(session, endpoints, display.say)
         try:
-            with closing(ZenohBus([], endpoints)) as bus, attending as should_end:
+            with closing(Connection(connect=endpoints).open()) as bus, attending as should_end:
                 monitor = SessionMonitor(bus, session, scenario, display)
                 while not interrupt.is_requested() and not should_end():
                     if _is_over([*sites, *recorder], result):
@@ -462,7 +463,7 @@ def _start(
         ]
         processes.append(starter.start(name, arguments))
     for index, name in enumerate(scenario.names):
-        if _needs_hand_process(scenario, name):
+        if scenario.sites[name].needs_hand_process:
             arguments = [
                 "hand",
                 name,
@@ -485,23 +486,11 @@ def _start(
     return starter, processes, start_recorder
 
 
-def _needs_hand_process(scenario: Scenario, site: str) -> bool:
-    """Returns True if an arm is moved by a user's program that needs a process of its own.
-
-    A slow program then cannot delay the control loop of the arm.
-
-    Args:
-        scenario: The scenario.
-        site: Name of the site.
-    """
-    own_hand = HandSite.find(scenario, site)
-    return own_hand is not None and own_hand.has_separate_process
-
-
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
     """Returns True if the session is over: a process has failed, or all processes have ended.
 
-    If one process fails, the others are not left running.
+    After the failure of one process, the session ends, so that the other processes do not keep
+    running.
 
     Args:
         children: The processes.
@@ -638,7 +627,7 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
     # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
     # is delivered as soon as the copy has one.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    return _StarterProcess(Connection(number)).serve()
+    return _StarterProcess(PipeEnd(number)).serve()
 
 
 class _StarterProcess:
@@ -650,7 +639,7 @@ class _StarterProcess:
         pipe: Connection to the requesting process.
     """
 
-    def __init__(self, pipe: Connection) -> None:
+    def __init__(self, pipe: PipeEnd) -> None:
         self._pipe = pipe
         self._running: dict[str, int] = {}
 

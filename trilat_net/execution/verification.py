@@ -32,7 +32,6 @@ from ..core import (
     LawChannel,
     PlantState,
     Site,
-    StaleAction,
     TickInput,
     TickRepeater,
     compute_fingerprint,
@@ -53,7 +52,6 @@ from ..log import (
 )
 from ..net import MODE_WORDS, STATE_VECTORS, State
 from ..records import TickRecord
-from ..scenario import parse_core_change
 from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable
 from .resumption import ArrivalEntry, RecordedInputs
 
@@ -401,7 +399,7 @@ class _SiteVerifier:
         # Under the stale rule "glide", the reference of a holding site does not depend on the
         # peers, unless its law reflects forces.
         reflects = setup.law_factory is not None or any(setup.gains.k_f)
-        self._detached = setup.on_stale.action is StaleAction.GLIDE and not reflects
+        self._detached = setup.on_stale.glides and not reflects
         self._starts = {boot: first for first, boot in log.starts.get(site, ())}
         self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
         self._last_tick = log.last_ticks[site]
@@ -791,7 +789,7 @@ class _SiteVerifier:
         changes: list[CoreChange] = []
         for change_tick, text in self._inputs.pop_changes(tick):
             try:
-                changes.append(parse_core_change(self._scenario, self._log.name, text))
+                changes.append(self._scenario.parse_core_change(self._log.name, text))
             except ScenarioError:
                 difference = RecordDifference(
                     site=self._log.name,

@@ -805,8 +805,6 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
     """
     used_ticks = site.used[peer]
     known: NDArray[np.bool_] = used_ticks >= 0  # -1 before the first sample
-    stamps_ns = used_ticks * NS_PER_S // rate_hz
-    age_ms = (site.t_ns - stamps_ns) / 1e6
     source = f"used.{peer}"
     yield Column(
         name=f"used_{peer}_tick",
@@ -818,7 +816,7 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
     )
     yield Column(
         name=f"age_{peer}_ms",
-        values=age_ms,
+        values=site.age_ns(peer, rate_hz) / 1e6,
         unit="ms",
         meaning=f"time since the stamp of the sample from {peer} in use",
         source=f"t_ns, {source}",

@@ -54,14 +54,12 @@ from ..net import (
 )
 from ..own_code import LawFiles, allow_logged_code
 from ..package_names import describe_missing_library
-from ..records import NS_PER_S
 from ..results import Result
 from ..scenario import (
     FAILED_HAND,
     PictureDelay,
     Scenario,
     TracePoint,
-    parse_core_change,
     parse_embedded,
 )
 from .accounting import LAST, Account, describe_unknown_ends
@@ -855,12 +853,12 @@ class Log(Result, Mapping[str, SiteLog]):
                 index: peer for index, peer in enumerate(peers) if peer not in stated
             }
             if not peers_without_end:
-                continue  # avoids decoding all records
-            for state in self[name].states:
-                for index, tick, _ in state.rx:
-                    peer = peers_without_end.get(index)
-                    if peer is not None and tick < self.scenario.ticks(peer):
-                        last_ticks[peer] = max(last_ticks[peer], tick)
+                continue  # avoids decoding all arrivals
+            _, arrivals = self[name].arrivals
+            for index, peer in peers_without_end.items():
+                received_ticks = arrivals[arrivals[:, 0] == index, 1]
+                possible_ticks = received_ticks[received_ticks < self.scenario.ticks(peer)]
+                last_ticks[peer] = int(possible_ticks.max(initial=last_ticks[peer]))
         return last_ticks
 
     def __getitem__(self, site: str) -> SiteLog:
@@ -941,7 +939,7 @@ class Log(Result, Mapping[str, SiteLog]):
         commands = {}
         try:
             for tick, texts in self.changes(site).items():
-                changes = [parse_core_change(self.scenario, site, text) for text in texts]
+                changes = [self.scenario.parse_core_change(site, text) for text in texts]
                 commands[tick] = changes
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None
@@ -983,11 +981,8 @@ class Log(Result, Mapping[str, SiteLog]):
         Returns:
             The ages, in ns. Ticks before the first sample came into use are left out.
         """
-        site_log = self[site]
-        used = site_log.used[peer]
-        has_sample = used >= 0
-        stamp_ns = used[has_sample] * NS_PER_S // self.scenario.sites[peer].rate_hz
-        return site_log.tick[has_sample] * NS_PER_S // site_log.rate_hz - stamp_ns
+        ages_ns = self[site].age_ns(peer, self.scenario.sites[peer].rate_hz)
+        return ages_ns[self[site].used[peer] >= 0]
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published about its network links, such as losses.

@@ -41,7 +41,7 @@ from ..log.ros2 import (
     Ros2Channels,
     Ros2Topics,
 )
-from .exports.ros2 import export_ros2
+from .export import Exporter
 
 RunCommand = Callable[[list[str], Mapping[str, str]], int]
 """Function that runs a command with the given environment and returns the exit code."""
@@ -105,7 +105,7 @@ def open_rerun(
         must_export = options.full or has_several_parts or not Ros2Topics.of_file(path)
         if must_export:
             print_line("making standard channels of every record ...")
-            export_ros2(read_log(), named_path)
+            Exporter("ros2", named_path).export(read_log())
             path = named_path
         elif path.name != named_path.name:
             named_path.symlink_to(path.resolve())

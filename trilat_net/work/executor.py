@@ -67,10 +67,6 @@ _MAX_NAME = 200
 """Largest number of characters of an item's name in an error message."""
 
 
-def ignore_progress(_done: int, _total: int) -> None:
-    """Does nothing. The default progress callback for callers that display no progress."""
-
-
 class _BatchResult(NamedTuple):
     """Results of a group of items, which a worker process returns to the main process.
 
@@ -133,7 +129,7 @@ def run_batch(
 class _Batch(NamedTuple):
     """A group of items that one worker process is working on.
 
-    It lists the items that return to the queue if the worker dies.
+    The items return to the queue if the worker dies.
 
     Attributes:
         numbers: Numbers of the items in the study, counted from 0.
@@ -460,7 +456,7 @@ class WorkerPool:
         self,
         function: Callable[[T], R],
         items: Sequence[T],
-        progress: Progress = ignore_progress,
+        progress: Progress | None = None,
         together: Together[T, R] | None = None,
         together_count: int = 1,
     ) -> list[R]:
@@ -471,7 +467,7 @@ class WorkerPool:
         Args:
             function: Module-level function, so that other processes can import it.
             items: The items, each passed to one call.
-            progress: Function that is called each time an item is finished.
+            progress: Function that is called each time an item is finished, if any.
             together: Function that replaces `function` for several items at once.
             together_count: Number of items to pass to `together`.
 
@@ -491,7 +487,8 @@ class WorkerPool:
             together_count=together_count,
         ):
             results[number] = result
-            progress(len(results), len(items))
+            if progress is not None:
+                progress(len(results), len(items))
         return [results[number] for number in range(len(items))]
 
     def _submit(
@@ -535,11 +532,9 @@ class WorkerPool:
         feed: _Feed[T],
         lost: Callable[[T], R] | None,
     ) -> Iterator[tuple[int, R]]:
-        """Yields the results of a finished batch.
+        """Yields the results of a finished batch, a group of items that one worker received.
 
-        If its worker died, the items are queued again.
-
-        A batch is a group of items that one worker process receives together.
+        If the worker process died, the items are queued again.
 
         Args:
             future: Future of the batch.

@@ -27,7 +27,7 @@ from functools import partial
 from pathlib import Path
 
 from trilat_net.app import RunningSession
-from trilat_net.errors import TrilatError, UsageError, count_nouns
+from trilat_net.errors import SessionError, TrilatError, UsageError, count_nouns
 from trilat_net.files import refuse_existing
 from trilat_net.log.ros2 import (
     COMMON_TOPICS,
@@ -50,7 +50,6 @@ from trilat_net.net import (
     Hand,
     Info,
     LinkStats,
-    RouterSilent,
     SessionMembers,
     State,
     SystemClock,
@@ -725,10 +724,10 @@ class _Bridge:
 
         Args:
             site: Name of the arm's site, whose scenario must allow a live hand.
-            running: The session.
+            running: Connection through which the targets are sent.
         """
         ends = self._ends
-        hand = running.open_hand(ends.bus, self._scenario, site, "ros2")
+        hand = running.open_hand(ends.bus, site, self._scenario, "ros2")
 
         frame = self._sites[site].frame
         topic_name, kind, read, apply = _describe_target(self._scenario, site, hand, frame)
@@ -1014,7 +1013,7 @@ def serve_ros2(
         while has_new_epoch and not stopped():
             try:
                 graph = open_graph(Refusals(say))
-            except RouterSilent as silent:
+            except SessionError as silent:
                 if not is_announced:
                     say(f"{silent}: waiting for it; {ROUTER_ADVICE}")
                 is_announced = True

@@ -176,11 +176,11 @@ def record_command(
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder import record_session
-    from sites import check_machine_load
 
     from ...files import refuse_existing
     from ...log import ChannelFilter, LogStorage, collect_provenance
     from ...net import RECORDER
+    from ..machine_load import check_machine_load
     from ..recorded_session import make_scenario_reader
     from .options import parse_viz_rate
 
@@ -594,8 +594,8 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> None:
     """Warns the user of everything in a replay that differed from the recording.
 
-    There may be damaged files, receivers that were disconnected because they were too slow, and
-    messages that were played late.
+    The warnings concern damaged files, receivers that were disconnected because they were too
+    slow, and messages that were played late.
 
     Args:
         outcome: Outcome of the replay.

@@ -37,7 +37,7 @@ from . import control
 from .jit import leaf
 from .row_fields import ArrivalRow, SiteRow
 from .site_arrays import SiteArrays, TickBuffers
-from .site_setup import Law, Scheme, StaleAction
+from .site_setup import Law, StaleAction
 from .ticks import LifeReason, Mode, tick_ns
 from .vectors import Array, IntArray, Points, RowArray, Vector
 
@@ -45,7 +45,6 @@ _DIVERGED = int(Mode.DIVERGED)
 _FAULT = int(Mode.FAULT)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
-_DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE = int(Law.ADAPTIVE)
 _USER = int(Law.USER)
 
@@ -129,7 +128,7 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
         theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
 
-    The rule is explicit, because Y' r does not depend on the estimate. The scheme DIGITAL
+    The rule is explicit, because Y' r does not depend on the estimate. The scheme `digital`
     instead advances the estimate with the Euler method at the end of the tick, in stage 8.
 
     Args:
@@ -152,7 +151,7 @@ def updates_estimate(k: int, s: SiteRow) -> bool:
     integrates at the end of the period. Whether the mode allows adaptation is decided by
     `adapts`.
     """
-    return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
+    return bool(not s.digital and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
@@ -349,7 +348,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
-    At the first tick, and under the scheme DIGITAL, u = tau_k.
+    At the first tick, and under the scheme `digital`, u = tau_k.
 
     Args:
         k: Current tick.
@@ -361,7 +360,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
         return
     for i in range(s.u.shape[0]):
         torque = s.tau[i]
-        if s.scheme != _DIGITAL and k > s.first:
+        if not s.digital and k > s.first:
             extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
             torque = control.limit_torque(extrapolated, s.tau_limit[i])
         s.u[i] = torque + s.held[i]
@@ -371,7 +370,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
     """Stores the torque and the adaptation rate Y' r of this tick for the next tick.
 
-    Y' r drives the parameter estimate; see `_update_estimate`. Under the scheme DIGITAL, this
+    Y' r drives the parameter estimate; see `_update_estimate`. Under the scheme `digital`, this
     function also advances the estimate itself.
 
     Args:
@@ -380,7 +379,7 @@ def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> Non
         is_adapting: Result of `adapts` before the arm moved.
     """
     h_s = 1.0 / s.rate_hz
-    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and is_adapting and s.mode != _DIVERGED:
+    if s.digital and s.law == _ADAPTIVE and is_adapting and s.mode != _DIVERGED:
         _advance_estimate(s, chain, h_s, s.Yr)
     for i in range(s.tau.shape[0]):
         s.tau_before[i] = s.tau[i]

@@ -15,12 +15,10 @@ import pytest
 
 import trilat_net
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reach_session
-from trilat_net.app.running_session import RunningSession
+from tests.sites.sessions import Session, reach_session
 from trilat_net.errors import UsageError
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
-from trilat_net.net.connection import Connection
 from trilat_net.scenario import load_scenario
 
 from .driving import ROBOT, TELEOPERATOR, assert_taken_over, drive
@@ -212,9 +210,7 @@ def test_a_person_takes_over_from_a_policy(
 
         @contextmanager
         def hold(_name: str, site: str, source: str, **_: Any) -> Iterator[Any]:
-            with RunningSession(SESSION, Connection(), bus, clock).open_hand(
-                bus, scenario, site, source
-            ) as hand:
+            with reach_session(bus, clock).open_hand(bus, site, scenario, source) as hand:
                 yield hand
 
         monkeypatch.setattr(trilat_net, "hand", hold, raising=False)

@@ -152,13 +152,8 @@ def _record(
 ) -> None:
     view = SessionView(bus, clock, SESSION)
     pages = SessionFrames(view)
-    hand = (
-        RunningSession(SESSION, Connection(), bus, clock).open_hand(
-            bus, scenario, recorded.user, "Ada"
-        )
-        if leads
-        else None
-    )
+    running = RunningSession(SESSION, Connection(), bus, clock)
+    hand = running.open_hand(bus, recorded.user, scenario, "Ada") if leads else None
     point_count = 0
     energy_count = 0
     event_count = 0

@@ -14,7 +14,7 @@ Invariant:
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,14 +25,13 @@ from trilat_net.errors import UsageError, count_nouns
 from trilat_net.files import digest_file, make_folder, make_results_folder, write_whole
 from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import parse_scenario
+from trilat_net.scenario import parse_embedded
 from trilat_net.work import (
     Progress,
     RunJournal,
     WorkerPool,
     Workers,
     encode_csv,
-    ignore_progress,
 )
 
 from .completion_times import COMPLETION, find_median, is_completed
@@ -239,7 +238,7 @@ class Experiment(Result):
         return _ExperimentStatus(len(done), len(self.plan.trials), next_trial)
 
     def run(
-        self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
+        self, jobs: int | None = None, show: Progress | None = None, on: Workers = None
     ) -> "Experiment":
         """Runs the remaining trials with synthetic participants and writes the result tables.
 
@@ -614,7 +613,7 @@ def open_experiment(folder: str | Path) -> Experiment:
     # The trials are planned again, so that the digest reveals a changed protocol.
     scenarios = {}
     for name, text in stored_plan["scenarios"].items():
-        scenarios[name] = parse_scenario(text, str(folder_path))
+        scenarios[name] = parse_embedded(text, str(folder_path))
     protocol = ExperimentProtocol.read(folder_path / PROTOCOL_FILE)
     plan = ExperimentPlan.of_protocol(protocol, scenarios=scenarios)
     if plan.digest != stored_plan["digest"]:
@@ -631,7 +630,7 @@ def run_experiment(
     *,
     jobs: int | None = None,
     on: Workers = None,
-    progress: Callable[[int, int], None] = ignore_progress,
+    progress: Progress | None = None,
 ) -> Experiment:
     """Runs an experiment with synthetic participants, as `trilat experiment run` does.
 

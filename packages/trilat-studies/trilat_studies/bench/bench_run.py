@@ -52,14 +52,13 @@ from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
-    StudyFolder,
     WorkerPool,
     Workers,
-    ignore_progress,
 )
 
 from ..measure_run import RecordBatch, WholeRun, describe_program
 from ..side_by_side import RunKind, prepare_kinds
+from ..study_folder import StudyFolder
 from ..tuning.candidate import TuningScenario
 from .bench_plan import (
     SHORTER_REACH,
@@ -389,7 +388,7 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
 
         tip = arm.place_end_effector(record.q, record.qd)
         t_s = record.t_ns / NS_PER_S
-        walls = VirtualWall.list_of_site(spec)
+        walls = VirtualWall.list_of_site(scenario, name)
         wall_forces += [wall.find_force(t_s, tip) for wall in walls]
 
     # There are no maxima if the task has no wall.
@@ -551,7 +550,7 @@ def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> floa
     tip = build_arm_rows(scenario, SLAVE).place_end_effector(record.q, record.qd)
     t_s = record.t_ns / NS_PER_S
     contact_times_s = []
-    for wall in VirtualWall.list_of_site(scenario.sites[SLAVE]):
+    for wall in VirtualWall.list_of_site(scenario, SLAVE):
         touching = np.flatnonzero(wall.find_force(t_s, tip) > 0.0)
         if len(touching):
             contact_times_s.append(float(t_s[touching[0]]))
@@ -814,7 +813,7 @@ ORIGIN_NAME = "origin.json"
 JOURNAL_NAME = "runs.journal"
 
 
-BenchFolder = StudyFolder[BenchPlan, BenchRun]
+BenchFolder = StudyFolder[BenchPlan, RunJournal[BenchRun]]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
@@ -883,7 +882,7 @@ def run_bench(
     folder: BenchFolder,
     jobs: int | None = None,
     on: Workers = None,
-    progress: Progress = ignore_progress,
+    progress: Progress | None = None,
     *,
     confirm: bool = False,  # noqa: ARG001
 ) -> BenchResults:
@@ -962,7 +961,7 @@ def _run_pending(
     items: list[BenchRunItem],
     jobs: int | None,
     on: Workers,
-    progress: Progress,
+    progress: Progress | None,
 ) -> None:
     """Executes the runs that are not yet in the journal, and stores each one when it ends.
 
