@@ -15,7 +15,8 @@ from trilat_net.analysis import LogMetrics, Stability
 from trilat_net.fields import split_unit
 from trilat_net.scenario import Expect
 
-from .measure_run import Range, RunMetrics
+from .measure_run import RunMetrics
+from .run_statistics import Range
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):

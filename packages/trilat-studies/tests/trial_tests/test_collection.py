@@ -11,15 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from trilat_studies.expectations import ExpectationResult
-from trilat_studies.measure_run import (
+from trilat_studies.measure_run import RunMetrics
+from trilat_studies.record_batches import (
     BATCH_RECORDS,
+    BatchedRun,
     RecordBatch,
-    RunMetrics,
-    SiteStats,
-    WindowStats,
-    run_compiled_in_batches,
     run_in_batches,
 )
+from trilat_studies.run_statistics import SiteStats, WindowStats
 
 import trilat_net
 from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, open_bytes
@@ -421,10 +420,9 @@ def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> No
     diverged_at_s, _ = run_in_batches(
         scenario, {name: batches.append for name, batches in by_tick.items()}
     )
-    run = run_compiled_in_batches(
-        scenario, {name: batches.append for name, batches in compiled.items()}
-    )
-    assert run.diverged_s == diverged_at_s
+    batched = BatchedRun(scenario, {name: batches.append for name, batches in compiled.items()})
+    batched.finish()
+    assert batched.run.diverged_s == diverged_at_s
     for name in scenario.names:
         records = RecordBatch.join(compiled[name])
         expected = RecordBatch.join(by_tick[name])

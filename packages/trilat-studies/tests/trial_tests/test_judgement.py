@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import CALM, make_run_metrics
 from trilat_studies.expectations import ExpectationResult
-from trilat_studies.measure_run import Range, RunMetrics
+from trilat_studies.measure_run import RunMetrics
+from trilat_studies.run_statistics import Range
 
 from trilat_net.analysis.run_end import EndBehaviour, EndDoubt, Stability
 from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
