@@ -65,7 +65,7 @@ SOURCE = "the operator"
 
 
 def _never_stopped() -> bool:
-    """Returns False. It is the function `stopped` for calls that only a time limit ends."""
+    """Returns False: the argument `stopped` of calls that end only after a time limit."""
     return False
 
 
@@ -771,7 +771,7 @@ def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
 
 
 def _list_present(scenario: Scenario, infos: dict[str, Info]) -> list[str]:
-    """Lists the arms' processes that a request to all arms addresses.
+    """Lists the sites to which a request to all arms is sent.
 
     These are all sites of the scenario. If the scenario allows sites to leave, they are only
     the running sites, as long as at least one site runs.

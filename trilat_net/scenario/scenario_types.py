@@ -32,7 +32,7 @@ from ..core import (
 )
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
-from ..laws import LawSettings, LawSituation, StabilityCondition
+from ..laws import LawSettings, LawSituation
 from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, list_named_code
 from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
@@ -221,7 +221,8 @@ class Scenario(Frozen, frozen=True, dict=True):
             index = (self.names.index(receiver), self.names.index(sender))
             delay_s[index] = link.find_effective_delay(self.sites[receiver].rate_hz)
         hold_s = self._find_hold_time()
-        hands = tuple(site.find_hand_impedances() for site in self.sites.values())
+        actors = tuple(site.actors for site in self.sites.values())
+        joints = tuple(len(site.q0_rad) for site in self.sites.values())
         for n, (name, site) in enumerate(self.sites.items()):
             situation = LawSituation(
                 site=n,
@@ -233,7 +234,8 @@ class Scenario(Frozen, frozen=True, dict=True):
                 rate_hz=site.rate_hz,
                 gravity_nm=self.arms[name].largest_gravity(site.arm.g_m_s2),
                 hold_s=hold_s,
-                hands=hands,
+                actors=actors,
+                joints=joints,
                 in_task_space=self.layout(name).task,
             )
             yield name, self.controls[n], situation
@@ -262,14 +264,15 @@ class Scenario(Frozen, frozen=True, dict=True):
             ticks_grow: True if the discrete-time loop is known to be unstable. The lines about
                 satisfied conditions then mention this.
         """
-        owners: dict[tuple[str, StabilityCondition], list[str]] = {}
+        conditions = {}
         for name, law, situation in self.law_situations():
             condition = law.condition(situation)
             if condition:
-                owners.setdefault((law.tag, condition), []).append(name)
+                conditions[name] = (law.tag, condition)
         verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
         lines = []
-        for (tag, condition), sites in owners.items():
+        for tag, condition in dict.fromkeys(conditions.values()):
+            sites = [name for name, owned in conditions.items() if owned == (tag, condition)]
             verdict = verdicts[condition.holds]
             line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
             if ticks_grow and condition.holds:

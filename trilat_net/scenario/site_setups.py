@@ -44,7 +44,7 @@ def build_site_setup(scenario: "Scenario", site: str) -> SiteSetup:
         qd_limit_rad_s=spec.limits.qd_limit_rad_s,
         q0=spec.q0_rad,
         qd0=spec.qd0_rad_s,
-        actors=tuple(actor.actor for actor in (*spec.hands, *spec.environment)),
+        actors=spec.actors,
         links=tuple(_build_link_setup(scenario, peer, site) for peer in scenario.peers(site)),
         ramps=tuple(scenario.scripted_ramps(site)),
         on_stale=spec.on_stale.rule,

@@ -14,10 +14,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from ..core import SCRIPTED_KINDS, Array, MotionLimits, StaleRule, TorqueKind
+from ..core import Array, MotionLimits, StaleRule, TorqueSource
 from ..fields import Frozen, Joints, KeyProblem, Positive, PositiveJoints, RateHz, Real
 from ..files import find_page
-from ..laws import ArmLoad
 from ..own_code import ImportedLaw
 from ..records import MAX_JOINTS
 from .arms import Arm, ArmModel, Task
@@ -242,6 +241,11 @@ class SiteSpec(Frozen, frozen=True):
         return {key: describe_value(value) for key, value in gains.items()}
 
     @property
+    def actors(self) -> tuple[TorqueSource, ...]:
+        """Operators and environments of the arm, in the form read by the control loop."""
+        return tuple(source.actor for source in (*self.hands, *self.environment))
+
+    @property
     def has_program_hand(self) -> bool:
         """True if a user's program operates the arm (a hand of kind "own").
 
@@ -257,33 +261,6 @@ class SiteSpec(Frozen, frozen=True):
         A slow program then does not delay the control loop of the site.
         """
         return any(isinstance(hand, ProgramHand) and hand.process for hand in self.hands)
-
-    def find_hand_impedances(self) -> tuple[ArmLoad, ...] | None:
-        """Returns the impedances of all operators and environments that react to motion.
-
-        Excludes operators whose torque depends on time alone.
-
-        Returns:
-            The spring and the damper of each. None if the reaction depends on the pose (because
-            an operator acts on the end effector), or is unknown (for a live operator or a
-            program).
-        """
-        impedances = []
-        for actor in (*self.hands, *self.environment):
-            source = actor.actor
-            if source.kind in SCRIPTED_KINDS:
-                continue
-            # A sampled torque lags behind the motion, so it is not that of a spring and damper.
-            if source.kind not in (TorqueKind.HAND, TorqueKind.VISCOUS) or source.sampled:
-                return None
-            joints = len(self.q0_rad)
-            stiffness = source.K or (0.0,)
-            impedance = ArmLoad(
-                stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
-                damping_nm_s_rad=tuple(np.broadcast_to(source.B, joints).tolist()),
-            )
-            impedances.append(impedance)
-        return tuple(impedances)
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
         """Returns the operator who may move the arm while the session runs.
