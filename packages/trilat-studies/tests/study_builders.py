@@ -18,9 +18,11 @@ import pytest
 from trilat_studies.bench import BenchPlan, plan_bench
 from trilat_studies.bench.bench_plan import BenchCell
 from trilat_studies.bench.bench_results import BenchRun
-from trilat_studies.measure_run import ExpectationResult, LinkAge, RunMetrics
+from trilat_studies.expectations import ExpectationResult
+from trilat_studies.measure_run import RunMetrics
+from trilat_studies.run_statistics import LinkAge
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
-from trilat_studies.sweep.stability_map import MapPlane
+from trilat_studies.sweep.map_plane import MapPlane
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_run import FinishedSweep
