@@ -12,6 +12,7 @@ Invariant:
     - No child process is left when a function returns.
 """
 
+import gc
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
@@ -29,7 +30,6 @@ from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
 from trilat_net.net import topics
-from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.signals import Interrupt
 
@@ -415,7 +415,10 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
         sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
         for name in sites_by_counts.values():
             warm_up(scenario, name)
-    freeze_gc()
+    # Collections in the forked copies then skip the objects that exist now, and the memory of
+    # these objects stays shared.
+    gc.collect()
+    gc.freeze()
     # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
     # is delivered as soon as the copy has one.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
