@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from ..core import LINK_PARAMETERS, POSE, POSITION
 from ..errors import LogError
-from ..files import import_extra
+from ..files import Extra
 from ..net import Event, LinkStats, State, json_schema
 from ..records import NS_PER_S
 from ..scenario import TASK_AXES, ArmModel, Scenario
@@ -57,6 +57,7 @@ UNIT_SUFFIXES = {
 """Maps each unit to the last part of a column's name."""
 EVENTS_TABLE = "events"
 """Name of the table with the events."""
+_FRAMES = Extra("frames", "data frames")
 SITE_TABLE_KINDS = ("state", "link", "arrivals")
 """Kinds of tables available for each site."""
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
@@ -195,7 +196,7 @@ class Table:
         Raises:
             UsageError: polars is not installed.
         """
-        pl = import_extra("polars", "frames", "data frames")
+        pl = _FRAMES.import_module("polars")
         all_series = []
         for column in self.columns:
             if column.is_text:
@@ -222,7 +223,7 @@ class Table:
                 values[column.name] = column.rows(0, len(column.values))
             else:
                 values[column.name] = column.numbers()
-        return import_extra("pandas", "frames", "data frames").DataFrame(values)
+        return _FRAMES.import_module("pandas").DataFrame(values)
 
     @classmethod
     def of_states(cls, site: SiteLog, scenario: Scenario) -> "Table":

@@ -33,9 +33,9 @@ from ..errors import (
     count_nouns,
     suggest_nearest,
 )
-from ..files import describe_missing_library
 from ..hooks import find_hook
 from ..own_code import LawFiles, allow_logged_code
+from ..package_names import describe_missing_library
 from ..results import Result
 from ..scenario import (
     FAILED_HAND,

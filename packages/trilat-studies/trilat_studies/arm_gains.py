@@ -50,7 +50,7 @@ from trilat_net.log import open_log
 from trilat_net.presentation import MARKS, Block, MarkedText, TextTable, describe_moving_states
 from trilat_net.results import Result, finite_or_none
 from trilat_net.scenario import BUILT_IN, Scenario, load_scenario
-from trilat_net.work import Progress, ignore_progress
+from trilat_net.work import Progress
 
 TUNED_LAWS = tuple(
     name
@@ -778,7 +778,7 @@ def tune_arm(
     poses: int = 16,
     seed: int = 1,
     curve: bool = False,
-    progress: Progress = ignore_progress,
+    progress: Progress | None = None,
 ) -> ArmGains:
     """Finds the largest gains with which identical arms follow one another stably over a delay.
 
@@ -845,7 +845,8 @@ def tune_arm(
     runs = list[dict[str, Any]]()
     steps = 1 + len(laws)
     for run_share, run_law in laws:
-        progress(1 + len(runs), steps)
+        if progress is not None:
+            progress(1 + len(runs), steps)
         run = search.confirm(run_law, run_share, pose, push)
         runs.append(run)
 

@@ -18,6 +18,7 @@ from tests.cli.running import trilat
 from tests.log.builders import edit_log_bytes
 from tests.scenario.builders import find_robot_files
 from tests.sites.visits import ping_sites
+from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import TrilatError, UsageError
 from tuning_tests.mode_count import count_growing
 from tuning_tests.odd_arms import ELBOW, ODD_ARMS, SHOULDER, write_arm
@@ -256,7 +257,7 @@ def test_sessions_have_the_delay_of_their_slowest_link(
     one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = ping_sites()  # of a party on the party's clock
-    monkeypatch.setattr("trilat_net.app.session_ping.ping_session", lambda *_, **__: report)
+    monkeypatch.setattr(RunningSession, "ping", lambda _: report)
     arguments = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
     facts = json.loads(trilat(*arguments, cwd=tmp_path).succeeds())
     assert facts["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
