@@ -15,7 +15,6 @@ import numpy as np
 
 from trilat_net.core import (
     LifeAlarm,
-    LifeReason,
     describe_mode,
     tick_ns,
 )
@@ -203,8 +202,7 @@ class SiteNews:
             return
 
         second = output.t_ns // NS_PER_S
-        is_too_far = self._parts.site.life_reason is LifeReason.ALIGN_LIMIT
-        if is_too_far and second > self._waiting_s:
+        if self._parts.site.is_too_far and second > self._waiting_s:
             self._waiting_s = second
             text = describe_mode(self._parts.name, output, glides=True)
             self._publisher.publish("waiting", text, t_ns=output.t_ns, ticks=output.tick)

@@ -99,11 +99,12 @@ def _examine_listening(
 ) -> DoctorFinding:
     """Checks whether this machine can listen at a network endpoint, by listening for a moment.
 
-    The port may be in use already. An unprotected endpoint causes a warning.
+    The check fails if, for example, another program uses the port. An unprotected endpoint
+    causes a warning.
 
     Args:
         endpoint: The endpoint, such as "tls/0.0.0.0:7447".
-        address: Its host and port.
+        address: Host and port of the endpoint.
         is_protected: True if the endpoint is encrypted or can only be reached from this
             machine.
     """
@@ -237,7 +238,7 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
 
 
 def _run_in_process(code: str) -> Any:
-    """Runs Python code in a new process, and returns the value that it prints.
+    """Runs Python code in a new process, and returns the value that the code prints.
 
     Some checks change the settings of their process, and must therefore not run in this
     process.
@@ -682,7 +683,7 @@ class MachineExamination:
             yield DoctorFinding("core", "warn", text)
 
     def _secure_connection(self) -> Connection:
-        """Returns the endpoints with the member's keys.
+        """Returns the connection of this member with the member's keys.
 
         Raises:
             UsageError: The endpoints are open to other machines without keys.

@@ -18,7 +18,7 @@ import numpy as np
 from ..core import CoreChange
 from ..errors import LogError, ScenarioError, UnknownName, WireError, count_nouns
 from ..net import READABLE, Event, LinkStats, RecorderStats, decode, topics
-from ..scenario import Scenario, parse_core_change, parse_embedded
+from ..scenario import Scenario, parse_embedded
 from .log_contents import ChannelMessages, LogContents
 from .site_log import SiteLog, TimedMessages
 
@@ -261,7 +261,7 @@ class DecodedLog(Mapping[str, SiteLog]):
         commands = {}
         try:
             for tick, texts in self.changes(site).items():
-                changes = [parse_core_change(self.scenario, site, text) for text in texts]
+                changes = [self.scenario.parse_core_change(site, text) for text in texts]
                 commands[tick] = changes
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None

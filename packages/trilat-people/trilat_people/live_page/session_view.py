@@ -46,7 +46,6 @@ from trilat_net.scenario import (
     LinkTables,
     PictureDelay,
     Scenario,
-    parse_core_change,
     parse_embedded,
 )
 
@@ -656,7 +655,7 @@ class SessionView:
         self._applied_changes.add(identity)
 
         try:
-            change = parse_core_change(self.scenario, site, text)
+            change = self.scenario.parse_core_change(site, text)
         except ScenarioError:
             self.dropped["no change"] += 1
             return
