@@ -29,7 +29,6 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, parse_embedded
 
 from ...log import (
-    ALL_CHANNELS,
     SCENARIO,
     SESSION,
     SITE_CHANNELS,
@@ -58,7 +57,7 @@ class PlaySelection:
         time: Whether the sending time or the arrival time of a message is used.
     """
 
-    channels: ChannelFilter = ALL_CHANNELS
+    channels: ChannelFilter = field(default_factory=ChannelFilter)
     start_ns: int | None = None
     stop_ns: int | None = None
     time: PlayTime = "publish"
