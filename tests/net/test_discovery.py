@@ -14,9 +14,9 @@ from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
 from trilat_net.net import session_members, topics
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import Connection, DefaultEndpoints
-from trilat_net.net.discovery import connect_to_session
-from trilat_net.net.membership import EventPublisher, liveliness_token
+from trilat_net.net.connection import Connection
+from trilat_net.net.default_endpoints import DefaultEndpoints
+from trilat_net.net.membership import EventPublisher
 from trilat_net.net.messages import VERSION, Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.session_members import SessionMembers
@@ -129,6 +129,29 @@ def test_members_are_found_despite_unreadable_answers() -> None:
     assert find_answering() == []
 
 
+def test_a_new_search_ignores_earlier_replies() -> None:
+    """A second search on the same object neither yields nor reports replies to the first one."""
+    network = LocalNetwork()
+    old_members = [network.join() for _ in range(2)]
+    for member, payload in zip(
+        old_members, (encode(answer_info("m0", 1)), b"garbage"), strict=True
+    ):
+        name = "m0" if payload != b"garbage" else "m1"
+        member.respond(topics.key(SESSION, name, topics.INFO), lambda _, sent=payload: sent)
+    members = SessionMembers(network.join(), ManualClock(), SESSION)
+
+    def search() -> Iterator[Info]:
+        return members.find(stopped=lambda: False, timeout_s=0.5)
+
+    assert next(search()).member == "m0"
+    old_members[0].close()
+    with pytest.raises(SessionError, match="the reply of m1 cannot be read"):
+        list(search())
+    old_members[1].close()
+    assert list(search()) == []
+    assert members.unreadable == {}
+
+
 def test_answers_of_other_versions_name_their_member() -> None:
     with pytest.raises(
         SessionError, match=f"the reply of m0 cannot be read: .* version {VERSION + 1}"
@@ -147,10 +170,13 @@ def test_waiting_recorders_announce_themselves_first() -> None:
     nowhere = Connection(connect=None)
     with (
         closing(first),
-        connect_to_session(
-            nowhere, CLOCK, session, lambda text: parse_scenario(text).names, **patience
+        nowhere.open_session(
+            CLOCK, session, lambda text: parse_scenario(text).names, **patience
         ) as bus,
     ):
         assert bus is not None
-        assert until(presence.poll) == (liveliness_token(session, topics.RECORDER, 7), True)
+        assert until(presence.poll) == (
+            topics.presence_token(session, topics.RECORDER, 7),
+            True,
+        )
         assert presence.poll() is None  # it stays announced
