@@ -17,8 +17,8 @@ from tests.net.waiting import until
 from tests.other_systems import prepare_process, replace_os
 from trilat_net import __main__
 from trilat_net.app import cli
-from trilat_net.files import STUDY_LIBRARIES
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.package_names import STUDY_LIBRARIES
 from trilat_net.scenario.scenario_reader import read_template
 
 from .running import PLAIN, trilat
@@ -50,6 +50,7 @@ import sys, threading
 from trilat_net import __main__
 from trilat_net.app import cli
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.package_names import STUDY_LIBRARIES
 called = threading.Event()
 def take(key, payload):
     called.set()

@@ -132,22 +132,22 @@ def test_members_are_found_despite_unreadable_answers() -> None:
 def test_a_new_search_ignores_earlier_replies() -> None:
     """A second search on the same object neither yields nor reports replies to the first one."""
     network = LocalNetwork()
-    old_members = [network.join() for _ in range(2)]
-    for member, payload in zip(
-        old_members, (encode(answer_info("m0", 1)), b"garbage"), strict=True
-    ):
-        name = "m0" if payload != b"garbage" else "m1"
-        member.respond(topics.key(SESSION, name, topics.INFO), lambda _, sent=payload: sent)
     members = SessionMembers(network.join(), ManualClock(), SESSION)
 
     def search() -> Iterator[Info]:
         return members.find(stopped=lambda: False, timeout_s=0.5)
 
-    assert next(search()).member == "m0"
-    old_members[0].close()
-    with pytest.raises(SessionError, match="the reply of m1 cannot be read"):
+    garbled = network.join()
+    garbled.respond(topics.key(SESSION, "m0", topics.INFO), lambda _: b"garbage")
+    with pytest.raises(SessionError, match="the reply of m0 cannot be read"):
         list(search())
-    old_members[1].close()
+    garbled.close()
+    answering = network.join()
+    for name in ("m1", "m2"):
+        reply = encode(answer_info(name, 1))
+        answering.respond(topics.key(SESSION, name, topics.INFO), lambda _, sent=reply: sent)
+    assert next(search()).member == "m1"
+    answering.close()
     assert list(search()) == []
     assert members.unreadable == {}
 

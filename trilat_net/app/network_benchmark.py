@@ -28,8 +28,8 @@ import msgspec
 import numpy as np
 
 from trilat_net.errors import RunFailed, ScenarioError, UsageError
-from trilat_net.files import require_libraries
 from trilat_net.net import topics
+from trilat_net.package_names import require_libraries
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 

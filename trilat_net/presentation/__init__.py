@@ -19,7 +19,6 @@ __all__ = [
     "Block",
     "MarkedText",
     "TextTable",
-    "compose",
     "compose_benchmark",
     "compose_citation",
     "compose_doctor",
@@ -72,7 +71,7 @@ if TYPE_CHECKING:
     from .foxglove_layout import write_foxglove_layout
     from .linear_text import describe_moving_states
     from .rerun_viewer import ViewerOptions, open_rerun
-    from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
+    from .result_text import MARKS, Block, MarkedText, TextTable, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
     from .summary_text import compose_benchmark, compose_doctor, compose_ping
     from .terminal_output import err, print_error, print_json, print_line, print_table
@@ -92,7 +91,7 @@ else:
             "foxglove_layout": "write_foxglove_layout",
             "linear_text": "describe_moving_states",
             "rerun_viewer": "ViewerOptions open_rerun",
-            "result_text": "Block MARKS MarkedText TextTable compose format_number",
+            "result_text": "Block MARKS MarkedText TextTable format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
             "summary_text": "compose_benchmark compose_doctor compose_ping",
             "terminal_output": (

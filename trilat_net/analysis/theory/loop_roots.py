@@ -40,7 +40,7 @@ from ...records import NS_PER_S, Mode
 from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
 from ..decision_facts import LoopRoots
-from ..delay_period import find_final_link, is_ending_trace
+from ..delay_period import find_final_link
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace
 from ..shared_slave import list_program_sites
 from ..timeline import Timeline
@@ -453,7 +453,7 @@ def _end_traces(scenario: Scenario) -> Scenario:
     for name in scenario.links:
         link = find_final_link(scenario, name)
         points = link.points
-        if not is_ending_trace(link) or points is None or not points[-1, 0] <= end_us:
+        if not link.has_ending_trace or points is None or not points[-1, 0] <= end_us:
             continue
         last_delays_ms[name] = 1e-3 * float(points[-1, 1])
     return scenario.with_constant_delays(last_delays_ms)
@@ -468,7 +468,7 @@ def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
     has_unknown_delay = {}
     for name in scenario.links:
         link = find_final_link(scenario, name)
-        has_unknown_delay[name] = link.random or link.measured or is_ending_trace(link)
+        has_unknown_delay[name] = link.random or link.measured or link.has_ending_trace
     return has_unknown_delay
 
 

@@ -256,7 +256,8 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
         session: Name of the session.
         concluded: True if a report is written into the folder of the log.
     """
-    from ...files import make_folder, make_results_folder, require_libraries
+    from ...files import make_folder, make_results_folder
+    from ...package_names import require_libraries
 
     if not concluded:
         return output if output is not None else Path(f"{session}.mcap")
