@@ -47,6 +47,7 @@ __all__ = [
     "PRIVATE_KEY",
     "add_keys",
     "create_keys",
+    "read_foreign_permissions",
     "read_member_keys",
     "renew_keys",
     # Messages and their encoding
@@ -147,6 +148,7 @@ if TYPE_CHECKING:
         PRIVATE_KEY,
         add_keys,
         create_keys,
+        read_foreign_permissions,
         read_member_keys,
         renew_keys,
     )
@@ -227,7 +229,7 @@ else:
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
                 "AUTHORITY CERTIFICATE HERE MEMBERS PRIVATE_KEY add_keys create_keys "
-                "read_member_keys renew_keys"
+                "read_foreign_permissions read_member_keys renew_keys"
             ),
             "membership": "Epoch EventPublisher LateSites describe_member new_boot",
             "messages": (

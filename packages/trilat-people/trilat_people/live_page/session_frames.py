@@ -75,7 +75,7 @@ class _ArmFrames:
         self._site = site
         self._model = scenario.arms[site]
         self._spec = scenario.sites[site]
-        self._walls = VirtualWall.list_of_site(self._spec)
+        self._walls = VirtualWall.list_of_site(scenario, site)
         self._hand = self._spec.find_live_hand()
         limits_nm = np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64)
         joint_count = self._model.counts.joints

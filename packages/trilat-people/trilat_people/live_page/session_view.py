@@ -45,7 +45,6 @@ from trilat_net.scenario import (
     LinkTables,
     PictureDelay,
     Scenario,
-    parse_core_change,
     parse_embedded,
 )
 
@@ -129,7 +128,7 @@ class SiteView:
         bodies: Mapping from tick to the poses of the bodies that its arm can touch, as far back
             as `window`.
         dropped: Mapping from reason to number of dropped messages.
-        repair: Tracks which of its messages have arrived, and requests missing ones.
+        repair: Tracks which of its messages have arrived, and requests the missing ones.
         record: Its newest record, or `None` before the first one.
         stats: Its newest statistics, or `None` before the first ones.
         first_tick: Tick of the first record if the observer joined late; otherwise 0.
@@ -644,7 +643,7 @@ class SessionView:
         self._applied_changes.add(identity)
 
         try:
-            change = parse_core_change(self.scenario, site, text)
+            change = self.scenario.parse_core_change(site, text)
         except ScenarioError:
             self.dropped["no change"] += 1
             return
