@@ -166,7 +166,7 @@ numbers would repeat, because each start numbers its events from 0.
 """
 
 
-class _PayloadHeader(msgspec.Struct):
+class PayloadHeader(msgspec.Struct):
     """The few fields of a message that the player decodes.
 
     They exist in all versions of the message format, so that old logs can be replayed.
@@ -179,16 +179,16 @@ class _PayloadHeader(msgspec.Struct):
     boot: int = -1
     n: int = -1
 
+    @staticmethod
+    def decode(payload: bytes) -> "PayloadHeader":
+        """Decodes the fields of a message. They keep their defaults if that is not possible."""
+        try:
+            return _decoder.decode(payload)
+        except (ValueError, RecursionError):
+            return PayloadHeader()
 
-_decoder = msgspec.msgpack.Decoder(_PayloadHeader)
 
-
-def _decode_header(payload: bytes) -> _PayloadHeader:
-    """Decodes the boot and the number of a message. Both are -1 if that is not possible."""
-    try:
-        return _decoder.decode(payload)
-    except (ValueError, RecursionError):
-        return _PayloadHeader()
+_decoder = msgspec.msgpack.Decoder(PayloadHeader)
 
 
 @dataclass(slots=True)
@@ -306,7 +306,7 @@ class _PlayedChannel:
         if self.kind != topics.EVENT:
             return t_ns
 
-        header = _decode_header(payload)
+        header = PayloadHeader.decode(payload)
         event_index = self._event_count
         self._event_count += 1
         has_number = header.n >= 0
@@ -432,7 +432,7 @@ class SessionReader:
             # The first message of a site contains the boot, the random number of the site's
             # start.
             if channel.site and channel.site not in header.boots:
-                boot = _decode_header(item.payload).boot
+                boot = PayloadHeader.decode(item.payload).boot
                 if boot >= 0:
                     header.boots[channel.site] = boot
 
