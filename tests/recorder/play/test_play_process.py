@@ -27,7 +27,7 @@ from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.log.message_identity import compute_virtual_boot
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.membership import Epoch, EventPublisher, liveliness_token
+from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, Info, State
 from trilat_net.net.requests import Backfill, BackfillRequest, Pong
 from trilat_net.net.session import SessionJoin
@@ -102,7 +102,7 @@ class Scribe:
         session = hall.options.session
         info = answer_info(topics.RECORDER, RECORDER_BOOT)
         bus.respond(topics.key(session, topics.RECORDER, topics.INFO), lambda _: encode(info))
-        bus.announce(liveliness_token(session, topics.RECORDER, RECORDER_BOOT))
+        bus.announce(topics.presence_token(session, topics.RECORDER, RECORDER_BOOT))
         publish = bus.publisher(topics.key(session, topics.RECORDER, topics.EVENT))
 
         def hear(_: str, payload: bytes) -> None:
@@ -172,7 +172,9 @@ def test_the_sites_tokens_stand_while_it_plays(log_file: Path) -> None:
     seen: list[tuple[str, bool]] = []
     hall.acts = {1: lambda: seen.extend(drained(hall.presence))}  # type: ignore[arg-type]
     hall.play()
-    tokens = {liveliness_token(SESSION, name, boot) for name, boot in hall.facts.boots.items()}
+    tokens = {
+        topics.presence_token(SESSION, name, boot) for name, boot in hall.facts.boots.items()
+    }
     assert set(seen) == {(key, True) for key in tokens}
     assert set(drained(hall.presence)) == {(key, False) for key in tokens}  # type: ignore[arg-type]
 

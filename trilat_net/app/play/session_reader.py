@@ -29,7 +29,6 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, parse_embedded
 
 from ...log import (
-    ALL_CHANNELS,
     SCENARIO,
     SESSION,
     SITE_CHANNELS,
@@ -58,7 +57,7 @@ class PlaySelection:
         time: Whether the sending time or the arrival time of a message is used.
     """
 
-    channels: ChannelFilter = ALL_CHANNELS
+    channels: ChannelFilter = field(default_factory=ChannelFilter)
     start_ns: int | None = None
     stop_ns: int | None = None
     time: PlayTime = "publish"
@@ -167,7 +166,7 @@ numbers would repeat, because each start numbers its events from 0.
 """
 
 
-class _PayloadHeader(msgspec.Struct):
+class PayloadHeader(msgspec.Struct):
     """The few fields of a message that the player decodes.
 
     They exist in all versions of the message format, so that old logs can be replayed.
@@ -180,16 +179,16 @@ class _PayloadHeader(msgspec.Struct):
     boot: int = -1
     n: int = -1
 
+    @staticmethod
+    def decode(payload: bytes) -> "PayloadHeader":
+        """Decodes the fields of a message. They keep their defaults if that is not possible."""
+        try:
+            return _decoder.decode(payload)
+        except (ValueError, RecursionError):
+            return PayloadHeader()
 
-_decoder = msgspec.msgpack.Decoder(_PayloadHeader)
 
-
-def _decode_header(payload: bytes) -> _PayloadHeader:
-    """Decodes the boot and the number of a message. Both are -1 if that is not possible."""
-    try:
-        return _decoder.decode(payload)
-    except (ValueError, RecursionError):
-        return _PayloadHeader()
+_decoder = msgspec.msgpack.Decoder(PayloadHeader)
 
 
 @dataclass(slots=True)
@@ -307,7 +306,7 @@ class _PlayedChannel:
         if self.kind != topics.EVENT:
             return t_ns
 
-        header = _decode_header(payload)
+        header = PayloadHeader.decode(payload)
         event_index = self._event_count
         self._event_count += 1
         has_number = header.n >= 0
@@ -433,7 +432,7 @@ class SessionReader:
             # The first message of a site contains the boot, the random number of the site's
             # start.
             if channel.site and channel.site not in header.boots:
-                boot = _decode_header(item.payload).boot
+                boot = PayloadHeader.decode(item.payload).boot
                 if boot >= 0:
                     header.boots[channel.site] = boot
 
