@@ -19,10 +19,9 @@ from trilat_net.app.play.play_process import (
     Playback,
     PlaybackSummary,
     PlayOptions,
-    map_key_to_session,
 )
 from trilat_net.app.play.player import PlayProgress
-from trilat_net.app.play.session_reader import PlaySelection, preload_messages
+from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, SessionReader
 from trilat_net.errors import SessionError
 from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.log.message_identity import compute_virtual_boot
@@ -34,6 +33,7 @@ from trilat_net.net.requests import Backfill, BackfillRequest, Pong
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.session_members import SessionMembers
 from trilat_net.net.wire import decode, encode
+from trilat_net.scenario import load_scenario
 
 from .clocks import LookedAt
 
@@ -76,7 +76,7 @@ class Hall:
         return self.watcher.query(topics.key(self.options.session, member, channel), payload)
 
     def play(self) -> PlaybackSummary:
-        self.facts, block = preload_messages([self.log], self.selection, 1 << 28)
+        self.facts, block = SessionReader([self.log], self.selection).preload(1 << 28)
         bus = self.network.join()
         replay = Playback(
             bus,
@@ -328,4 +328,6 @@ def test_existing_sessions_are_refused() -> None:
     ],
 )
 def test_keys_use_the_new_session_name(topic: str, key: str) -> None:
-    assert map_key_to_session(topic, "paper", "again") == key
+    scenario = load_scenario("paper")
+    header = SessionHeader("paper", scenario, scenario.text, fingerprint="", version=0)
+    assert header.map_topic(topic, "again") == key
