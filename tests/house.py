@@ -94,6 +94,14 @@ def list_interface(package: str) -> list[str]:
     return []
 
 
+def list_registered_hooks() -> Iterator[str]:
+    """Yields the names of the functions that packages register in `hooks`."""
+    for path in files():
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "register_hooks":
+                yield from ast.literal_eval(node.args[1])
+
+
 @cache
 def interface_homes(package: str) -> dict[str, str]:
     """Returns the module of each name of an interface, relative to the package.

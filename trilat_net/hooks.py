@@ -57,11 +57,6 @@ def find_hook(hook: str) -> Any:
     return _loaders[hook]()
 
 
-def list_hooks() -> list[str]:
-    """Returns the names of all registered hooks, for the tests."""
-    return list(_loaders)
-
-
 def import_on_use(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
     """Returns a `__getattr__` for a package, which imports modules when first needed.
 
