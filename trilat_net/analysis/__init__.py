@@ -36,9 +36,9 @@ __all__ = [
     "premise_quantities",
     "verdict_facts",
     # Twins
-    "MOST_LOG",
     "EnvelopeFit",
     "EnvelopeTrend",
+    "SMALLEST",
     "PushGrowth",
     "PushedTwins",
     "TwinGrowth",
@@ -124,7 +124,8 @@ if TYPE_CHECKING:
     from .timeline import Timeline
     from .torque_sources import SourceRows, TorqueSplit, VirtualWall
     from .twins.envelope_trend import EnvelopeFit, EnvelopeTrend
-    from .twins.twin_growth import MOST_LOG, PushedTwins, PushGrowth, TwinGrowth, twin
+    from .twins.twin_growth import PushedTwins, PushGrowth, TwinGrowth, twin
+    from .twins.twin_runs import SMALLEST
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -163,6 +164,7 @@ else:
             "timeline": "Timeline",
             "torque_sources": "SourceRows TorqueSplit VirtualWall",
             "twins.envelope_trend": "EnvelopeFit EnvelopeTrend",
-            "twins.twin_growth": "MOST_LOG PushGrowth PushedTwins TwinGrowth twin",
+            "twins.twin_growth": "PushGrowth PushedTwins TwinGrowth twin",
+            "twins.twin_runs": "SMALLEST",
         },
     )

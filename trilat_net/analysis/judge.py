@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..execution import FusedRun, SimulatedLog, simulate_columns
+from ..execution import FusedRun, SimulatedLog
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario
 from .blas_threads import limit_blas_threads
@@ -174,7 +174,7 @@ def judge_virtual_run(
         if ObservedEnergy.find_laws(executed_scenario, own_laws=True):
             log: Log = SimulatedLog(executed_scenario)
         else:
-            log = simulate_columns(executed_scenario)
+            log = FusedRun.simulate_log(executed_scenario)
         certificate_of_log = Certificate.of_log(log, own_laws=True)
         certificate = replace(
             certificate_of_log,

@@ -39,7 +39,7 @@ from msgspec.structs import asdict
 from trilat_net.analysis import LogMetrics
 from trilat_net.core import is_core_cached
 from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
-from trilat_net.execution import check_virtual, execute_virtual, verify_log
+from trilat_net.execution import SimulatedLog, execute_virtual, verify_log
 from trilat_net.log import open_log
 from trilat_net.net import SystemClock
 from trilat_net.presentation import Block, MarkedText, TextTable
@@ -250,7 +250,7 @@ def trials(
     label = ExperimentText.read(source).label
     _check_expectations_reachable(scenario, label)
     if not live:
-        check_virtual(scenario)
+        SimulatedLog.check_scenario(scenario)
 
     distinct_seeds = list(dict.fromkeys(seeds)) or [scenario.seed]
     for seed in distinct_seeds:
