@@ -12,7 +12,7 @@ import tomli_w
 
 from trilat_net.errors import ScenarioError, join_arguments
 from trilat_net.own_code import name_law_classes
-from trilat_net.scenario import is_distribution, is_number
+from trilat_net.scenario import is_distribution
 
 
 def format_command(*arguments: str) -> str:
@@ -80,7 +80,17 @@ def format_override_value(value: Any) -> str:
             decimal point if it is an integer. Any other value, such as a word, is converted to
             a string.
     """
-    return repr(value).removesuffix(".0") if is_number(value) else str(value)
+    return repr(value).removesuffix(".0") if isinstance(value, int | float) else str(value)
+
+
+def format_override(key: str, value: Any) -> str:
+    """Returns the override that sets a key to a value, such as "control.d=1.5".
+
+    Args:
+        key: Dotted path of the scenario key.
+        value: The value, see `format_override_value`.
+    """
+    return f"{key}={format_override_value(value)}"
 
 
 def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

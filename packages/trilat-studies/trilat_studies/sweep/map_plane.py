@@ -23,7 +23,7 @@ from trilat_net.core import Array
 from trilat_net.errors import UsageError
 from trilat_net.scenario import Scenario, is_number
 
-from ..run_commands import format_override_value
+from ..run_commands import format_override
 from .sweep_axis import label_axis, label_setting
 from .sweep_cell import RUN_CLASSES, CellClass
 from .sweep_plan import SweepPlan
@@ -292,9 +292,7 @@ class MapPanel(NamedTuple):
         only_law = next(iter(plan.laws), "")
         law = settings.pop(LAW_AXIS, only_law)
         overrides = [*plan.laws.get(law, ())]
-        overrides += [
-            f"{key}={format_override_value(value)}" for key, value in settings.items()
-        ]
+        overrides += [format_override(key, value) for key, value in settings.items()]
         return partial(_load_grid_scenario, plan, tuple(overrides), x, y)
 
 
@@ -557,6 +555,4 @@ def _load_grid_scenario(
     Raises:
         ScenarioError: The scenario is not valid with these values.
     """
-    x_override = f"{x}={format_override_value(x_value)}"
-    y_override = f"{y}={format_override_value(y_value)}"
-    return plan.scenario(*fixed, x_override, y_override)
+    return plan.scenario(*fixed, format_override(x, x_value), format_override(y, y_value))

@@ -29,7 +29,7 @@ from trilat_net.results import Result
 from trilat_net.scenario import Scenario
 from trilat_net.work import Progress, WorkerPool, Workers
 
-from ..run_commands import format_override_value
+from ..run_commands import format_override, format_override_value
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
 from .map_plane import StabilityEdge
@@ -313,7 +313,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
         Args:
             value: Value of the searched key.
         """
-        override = f"{key}={format_override_value(value)}"
+        override = format_override(key, value)
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def is_stable(value: float) -> bool | None:
