@@ -60,6 +60,7 @@ __all__ = [
     "Finding",
     "Integrity",
     "LogCheckResult",
+    "LogQuality",
     "Recovery",
     "RecoverySurvey",
     "StartGap",
@@ -76,6 +77,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from .accounted_log import LogQuality
     from .accounting import (
         LAST,
         MIN_COVERAGE,
@@ -134,6 +136,7 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
+            "accounted_log": "LogQuality",
             "accounting": "Account Coverage LAST MIN_COVERAGE StartGap describe_unknown_ends",
             "data_tables": "Column Table",
             "findings": "CheckReport Finding",
