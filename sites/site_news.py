@@ -19,9 +19,8 @@ from trilat_net.core import (
     tick_ns,
 )
 from trilat_net.errors import count_nouns
-from trilat_net.log import compute_task_errors
+from trilat_net.log import compute_task_errors, count_skipped_ticks
 from trilat_net.net import MODE_WORDS, EventPublisher
-from trilat_net.recorded_change import count_skipped_ticks
 from trilat_net.records import NS_PER_S, Mode, TickRecord
 from trilat_net.scenario import Change
 

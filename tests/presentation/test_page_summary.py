@@ -30,7 +30,6 @@ from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.conclusion import _tabulate_sites, conclude
 from trilat_net.presentation.page_summary import (
-    find_error_peak,
     render_checks,
     render_key_numbers,
     render_verdict,
@@ -153,7 +152,7 @@ def test_key_numbers_have_place_and_time() -> None:
     html = render_key_numbers(log, facts)
     names = {"s from its reference": ["s"], "m1 and m2 from the others": ["m1", "m2"]}
     for name, sites in names.items():
-        peak = find_error_peak(log, sites)
+        peak = JointError.find_largest_of_all(log, sites)
         assert peak is not None
         assert peak.value == max(facts["sites"][site]["max_error_rad"] for site in sites)
         joint = int(peak.joint.removeprefix(f"{peak.site} joint ")) - 1

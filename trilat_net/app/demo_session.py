@@ -18,6 +18,7 @@ Invariant:
       this process, which then ends the children in the right order.
 """
 
+import gc
 import os
 import signal
 import subprocess
@@ -40,14 +41,13 @@ from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
 from trilat_net.net import topics
-from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.signals import Interrupt
 
 from ..core import compiling_notice, is_core_cached
 from ..files import refuse_link
 from ..log import Log, open_log
-from ..net import Clock, Connection, DefaultEndpoints, SystemClock
+from ..net import Clock, Connection, DefaultEndpoints, SessionMembers, SystemClock
 from ..records import NS_PER_S
 from .machine_load import check_machine_load
 from .monitor import SessionDisplay, SessionMonitor
@@ -363,7 +363,8 @@ def run_demo(
             attending = attend(session, endpoints, display.say)
         try:
             with closing(Connection(connect=endpoints).open()) as bus, attending as should_end:
-                monitor = SessionMonitor(bus, session, scenario, display)
+                members = SessionMembers(bus, clock, session)
+                monitor = SessionMonitor(members, scenario, display)
                 while not interrupt.is_requested() and not should_end():
                     if _is_over([*sites, *recorder], result):
                         break
@@ -620,7 +621,10 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
         sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
         for name in sites_by_counts.values():
             warm_up(scenario, name)
-    freeze_gc()
+    # Collections in the forked copies then skip the objects that exist now, and the memory of
+    # these objects stays shared.
+    gc.collect()
+    gc.freeze()
     # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
     # is delivered as soon as the copy has one.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

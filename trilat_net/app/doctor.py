@@ -29,7 +29,6 @@ from typing import Any, Literal, NamedTuple
 from sites import rehearse_loop, warm_up
 from trilat_net import workers
 from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
-from trilat_net.files import read_foreign_permissions
 from trilat_net.results import Result
 from trilat_net.scenario import load_scenario
 
@@ -383,8 +382,7 @@ class MachineExamination:
         Yields:
             The findings about the keys.
         """
-        folder = self._keys_folder
-        if folder is None:
+        if self._keys_folder is None:
             yield DoctorFinding(
                 "keys",
                 "ok",
@@ -411,19 +409,8 @@ class MachineExamination:
         else:
             yield DoctorFinding("keys", "ok", description)
 
-        if read_foreign_permissions(folder):
-            yield DoctorFinding(
-                "keys", "warn", f"other users can read {folder}; run: chmod 700 {folder}"
-            )
-
-        # Anybody who has the key of the authority could create keys for further members.
-        authority = folder.resolve().parent / "authority" / PRIVATE_KEY
-        if authority.exists():
-            description = (
-                f"the authority's key {authority} should not be on this machine, because it "
-                "can create keys for anybody; keep it elsewhere"
-            )
-            yield DoctorFinding("keys", "warn", description)
+        for risk in member_keys.list_risks():
+            yield DoctorFinding("keys", "warn", risk)
 
     def check_links(self) -> Iterator[DoctorFinding]:
         """Checks whether each network endpoint can be opened or reached, and is encrypted.

@@ -45,10 +45,10 @@ from ..log import (
     Log,
     Progress,
     SiteLog,
+    count_skipped_ticks,
     open_log,
 )
 from ..net import MODE_WORDS, STATE_VECTORS, State
-from ..recorded_change import count_skipped_ticks
 from ..records import TickRecord
 from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable
 from .resumption import ArrivalEntry, RecordedInputs

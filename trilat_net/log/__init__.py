@@ -67,6 +67,7 @@ __all__ = [
     "check_file",
     "create_signing_keys",
     "describe_unknown_ends",
+    "count_skipped_ticks",
     "recover",
     "sign_log",
     # Orientations
@@ -84,6 +85,7 @@ if TYPE_CHECKING:
         Account,
         Coverage,
         StartGap,
+        count_skipped_ticks,
         describe_unknown_ends,
     )
     from .data_tables import Column, Table
@@ -115,12 +117,7 @@ if TYPE_CHECKING:
     from .mcap_reader import McapReader, Progress
     from .mcap_writer import McapWriter, Sink
     from .message_identity import compute_virtual_boot
-    from .orientations import (
-        MATRIX_ENTRIES,
-        QuaternionSigns,
-        RotationVectors,
-        expand_poses,
-    )
+    from .orientations import MATRIX_ENTRIES, QuaternionSigns, RotationVectors, expand_poses
     from .packed.indexed_records import IndexedRecords
     from .provenance import collect_provenance
     from .record_columns import Ints
@@ -137,22 +134,25 @@ else:
         __name__,
         {
             "accounted_log": "LogQuality",
-            "accounting": "Account Coverage LAST MIN_COVERAGE StartGap describe_unknown_ends",
+            "accounting": (
+                "Account Coverage LAST MIN_COVERAGE StartGap count_skipped_ticks "
+                "describe_unknown_ends"
+            ),
             "data_tables": "Column Table",
             "findings": "CheckReport Finding",
+            "log_contents": "LogContents",
             "log_file": "LogFile",
             "log_layout": (
-                "ACTIVE_SUFFIX CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY "
-                "MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT"
+                "ACTIVE_SUFFIX CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY MAX_TIME_NS "
+                "RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT"
             ),
             "log_reader": "Log open_log",
             "log_signature": "create_signing_keys sign_log",
             "log_writer": "LogParts LogStorage LogWriter MakeViews PutMessage ReceiveMessage",
-            "log_contents": "LogContents",
             "mcap_reader": "McapReader Progress",
             "mcap_writer": "McapWriter Sink",
             "message_identity": "compute_virtual_boot",
-            "orientations": ("MATRIX_ENTRIES QuaternionSigns RotationVectors expand_poses"),
+            "orientations": "MATRIX_ENTRIES QuaternionSigns RotationVectors expand_poses",
             "packed.indexed_records": "IndexedRecords",
             "provenance": "collect_provenance",
             "record_columns": "Ints",

@@ -271,23 +271,6 @@ def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
     return render_macro("summary.html", "key_numbers", numbers=numbers)
 
 
-def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
-    """Finds the largest tracking error of any joint in a run, with its joint and time.
-
-    The tracking error is the difference between a joint angle and its reference.
-
-    Args:
-        log: Log of the run.
-        sites: Names of the sites to consider. Empty for all sites.
-
-    Returns:
-        The earliest occurrence of the largest error. `None` if no record has a finite error.
-    """
-    peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
-    known_peaks = [peak for peak in peaks if peak is not None]
-    return max(known_peaks, key=lambda peak: peak.value, default=None)
-
-
 def _list_error_cards(log: Log) -> list[_KeyNumber]:
     """Returns the key figures about errors, for the slaves and then for the masters.
 
@@ -316,7 +299,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
         place: Phrase for the pose from which the error is measured, appended to the name of the
             number.
     """
-    peak = find_error_peak(log, sites)
+    peak = JointError.find_largest_of_all(log, sites)
     if peak is None:
         return _KeyNumber(f"{join_words(sites)} {place}", NO_NUMBER, "no record")
 

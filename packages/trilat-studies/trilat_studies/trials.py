@@ -47,7 +47,8 @@ from trilat_net.results import Result
 from trilat_net.scenario import ExperimentText, Scenario, load_scenario
 from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers
 
-from .measure_run import ExpectationResult, RunMetrics
+from .expectations import ExpectationResult
+from .measure_run import RunMetrics
 from .run_commands import format_command, list_assignments, set_options
 from .side_by_side import RunKind, describe_runs_alone, prepare_kinds
 
@@ -142,7 +143,7 @@ class Trial(NamedTuple):
         Returns:
             The result of the trial.
         """
-        outcomes = metrics.compare_with(self.scenario.expect)
+        outcomes = ExpectationResult.list_of_run(metrics, self.scenario.expect)
         return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
 
     def run(self) -> TrialResult:

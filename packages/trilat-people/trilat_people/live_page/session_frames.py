@@ -678,7 +678,7 @@ class SessionFrames:
         missing_count = 0
         has_seen_all = site.first_tick == 0
         if has_seen_all:
-            state_account = site.reception.accounts["state"]
+            state_account = site.repair.reception.accounts["state"]
             missing_count = state_account.missing
         # The source is the number of the program that holds the arm at present, or 0.
         is_held = bool(state.get("source"))

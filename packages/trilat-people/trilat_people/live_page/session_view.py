@@ -37,7 +37,6 @@ from trilat_net.net import (
     LinkStats,
     SessionMembers,
     State,
-    decode,
     topics,
 )
 from trilat_net.records import NS_PER_S
@@ -122,7 +121,6 @@ class SiteView:
         layout: Numbers of joints and peers in its records, if the site continues without a lost
             peer; otherwise `None`.
         hand: Settings for people who hold its arm, or `None` if nobody can hold it.
-        reception: Tracks which of its messages have arrived.
         window: Its latest records.
         holder: Person or program that last took hold of its arm.
         stopped_by: Person or program that requested its last stop, according to the site's
@@ -130,7 +128,7 @@ class SiteView:
         bodies: Mapping from tick to the poses of the bodies that its arm can touch, as far back
             as `window`.
         dropped: Mapping from reason to number of dropped messages.
-        repair: Requests for its missing messages.
+        repair: Tracks which of its messages have arrived, and requests the missing ones.
         record: Its newest record, or `None` before the first one.
         stats: Its newest statistics, or `None` before the first ones.
         first_tick: Tick of the first record if the observer joined late; otherwise 0.
@@ -159,7 +157,6 @@ class SiteView:
         self.bodies: dict[int, list[float]] = {}
         self.dropped: Counter[str] = Counter()
         self.repair = GapRepair(bus, session, scenario, name, boot, self.dropped)
-        self.reception = self.repair.reception
         self.record: State | None = None
         self.stats: LinkStats | None = None
         self.first_tick = 0
@@ -210,7 +207,7 @@ class SiteView:
     @property
     def ended(self) -> bool:
         """True once the site has published its end, after which it sends no more records."""
-        return self.reception.final_ticks is not None
+        return self.repair.reception.final_ticks is not None
 
     @property
     def complete(self) -> int:
@@ -218,7 +215,7 @@ class SiteView:
 
         No earlier record can still arrive. -1 before the first record.
         """
-        record_account = self.reception.accounts[topics.STATE]
+        record_account = self.repair.reception.accounts[topics.STATE]
         gap = record_account.find_requestable_gap()
         if gap is None:
             return record_account.last
@@ -308,7 +305,9 @@ class SessionView:
         """
         if self._left_ns is None:
             return False
-        arrivals_ns = [site.reception.last_received_ns or 0 for site in self.sites.values()]
+        arrivals_ns = [
+            site.repair.reception.last_received_ns or 0 for site in self.sites.values()
+        ]
         since_ns = max(self._left_ns, *arrivals_ns)
         return self._clock.monotonic_ns() - since_ns > AWAY_NS
 
@@ -328,7 +327,7 @@ class SessionView:
         Args:
             site: The site.
         """
-        received_ns = site.reception.last_received_ns
+        received_ns = site.repair.reception.last_received_ns
         if received_ns is None or site.ended:
             return 0.0
         silence_ns = self._clock.monotonic_ns() - received_ns
@@ -498,17 +497,17 @@ class SessionView:
             return
 
         channel = parts.channel
-        for payload in site.reception.split(channel, block):
+        for payload in site.repair.reception.split(channel, block):
             try:
-                message = site.reception.read(channel, payload)
+                message = site.repair.reception.read(channel, payload)
             except WireError:
                 # Messages of an unknown boot (start of the process) cannot be read. A site that
                 # has been started again announces its new boot with an event.
                 may_announce_boot = channel == topics.EVENT
-                if not may_announce_boot or not self._accept_new_boot(parts.member, payload):
+                if not may_announce_boot or not self._accept_new_boot(site, payload):
                     raise
                 # From now on, messages of the new boot can be read.
-                message = site.reception.read(channel, payload)
+                message = site.repair.reception.read(channel, payload)
 
             has_stored_none = site.record is None and site.stats is None
             is_first = has_stored_none and channel != topics.EVENT
@@ -516,35 +515,24 @@ class SessionView:
                 self._skip_records_before(site, message.content)
 
             # A message that has arrived before, for example on request, is not stored again.
-            is_new = site.reception.accept(channel, message, mono_ns)
+            is_new = site.repair.reception.accept(channel, message, mono_ns)
             if is_new:
                 self._store(parts.member, site, channel, message.content)
 
-    def _accept_new_boot(self, name: str, payload: bytes) -> bool:
-        """Switches to a restarted site, if an event announces the restart.
-
-        Each start of a site is identified by a random number, its boot. Messages with an
-        unknown boot are dropped until an event announces that the new process has joined the
-        session.
+    def _accept_new_boot(self, site: SiteView, payload: bytes) -> bool:
+        """Switches to a restarted site, if an event announces that it has joined the session.
 
         Args:
-            name: Name of the site.
+            site: View of the site.
             payload: The event.
 
         Returns:
             True if the event belongs to a restarted site that may join.
         """
-        event = decode(payload, Event)
-        site = self.sites[name]
-        is_join = event.kind == "join" and event.member == name
-        names_own_boot = event.boots.get(name) == event.boot
-        if not is_join or not names_own_boot:
+        boot = site.repair.reception.find_new_boot(payload, ("join",))
+        if boot is None:
             return False
-        if self.scenario is None or not self.scenario.sites_may_return:
-            return False
-
-        site.repair = site.repair.follow_start(event.boot)
-        site.reception = site.repair.reception
+        site.repair = site.repair.follow_start(boot)
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
@@ -566,7 +554,7 @@ class SessionView:
 
         site.first_tick = tick
         for channel in (topics.STATE, topics.LINK):
-            account = site.reception.accounts[channel]
+            account = site.repair.reception.accounts[channel]
             account.abandon_below(tick)
         site.repair.probe()
 
