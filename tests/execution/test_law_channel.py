@@ -97,7 +97,9 @@ def test_records_with_wrong_law_messages_are_unreadable() -> None:
 
 def test_viewers_get_a_channel_per_vector(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    virtual.record_virtual(load_scenario("paper", SHORT), path, views_hz=FULL_RATE_HZ)
+    virtual.SimulatedLog.record_scenario(
+        load_scenario("paper", SHORT), path, views_hz=FULL_RATE_HZ
+    )
     channels = Ros2Topics.of_file(path)
     about = {
         topic.rpartition("/")[2]: channel_data.about

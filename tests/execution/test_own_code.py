@@ -14,7 +14,7 @@ from trilat_net.core.life.own_hand import HandView
 from trilat_net.core.step.site_step import Site
 from trilat_net.errors import CodeWithheld, PlantFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.execution.virtual import SimulatedLog, record_virtual
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.log.log_reader import Log
 from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.scenario import Scenario, load_scenario
@@ -200,7 +200,7 @@ def test_failing_plants_are_named_and_end_runs(how: str, problem: str, tmp_path:
     with pytest.raises(
         PlantFailed, match=rf"the plant tests\.own_code:Torn of s failed at tick 199: {problem}"
     ):
-        record_virtual(scenario, path)
+        SimulatedLog.record_scenario(scenario, path)
     log = tn.open_log(path)
     assert len(log["s"]) >= 199
     assert [event.text for event in log.events if event.kind == "failed"]

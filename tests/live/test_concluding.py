@@ -11,7 +11,7 @@ import pytest
 import recorder.record_process
 from tests.cli.running import trilat
 from tests.net.free_endpoints import find_free_endpoints
-from trilat_net.execution.virtual import record_virtual
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.log.log_writer import LogStorage
 from trilat_net.scenario import load_scenario
 
@@ -38,7 +38,7 @@ def test_a_diverged_run_fails_despite_sound_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def recorded(storage: LogStorage, afterwards: Callable[[], None], **_others: object) -> int:
-        assert not record_virtual(
+        assert not SimulatedLog.record_scenario(
             load_scenario("two_sites", {"limits.qd_limit_rad_s": 0.01}), storage.path
         )
         afterwards()

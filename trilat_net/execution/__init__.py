@@ -15,7 +15,6 @@ __all__ = [
     "SimulatedLog",
     "execute_virtual",
     "find_absent_samples",
-    "record_virtual",
     # Execution of a log
     "LogCheckReport",
     "Rerun",
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from .fused import FusedRun
     from .log_checks import LogCheckReport
     from .verification import verify_log
-    from .virtual import SimulatedLog, execute_virtual, record_virtual
+    from .virtual import SimulatedLog, execute_virtual
     from .virtual_comparison import find_absent_samples
     from .what_if import Rerun, rerun
 else:
@@ -37,7 +36,7 @@ else:
             "fused": "FusedRun",
             "log_checks": "LogCheckReport",
             "verification": "verify_log",
-            "virtual": "SimulatedLog execute_virtual record_virtual",
+            "virtual": "SimulatedLog execute_virtual",
             "virtual_comparison": "find_absent_samples",
             "what_if": "Rerun rerun",
         },

@@ -605,49 +605,6 @@ def write_virtual_log(
     return within_limits
 
 
-def record_virtual(
-    scenario: Scenario,
-    path: Path,
-    *,
-    force: bool = False,
-    stopped: Callable[[], bool] = lambda: False,
-    views_hz: float = VIZ_HZ,
-    hands: HandTracks = {},  # noqa: B006
-    policies: Collection[str] = (),
-) -> bool:
-    """Simulates a scenario faster than real time, and writes the log of the run to a file.
-
-    Args:
-        scenario: The scenario, with its sites and links.
-        path: File to which the log is written.
-        force: If True, an existing file is replaced.
-        stopped: Function that is called after each tick. The run ends if it returns True.
-        views_hz: Rate of the additional channels for viewers, in Hz.
-        hands: Actions of live operators, see `execute_virtual`.
-        policies: Sites whose live operator is a trained program. The log contains one event for
-            each.
-
-    Returns:
-        True if all sites stayed within their limits, False if one diverged.
-
-    Raises:
-        UsageError: The file exists, or cannot be created.
-        LogRefused: Writing to the disk failed. The error names the part of the log that is
-            kept.
-        ScenarioError: The scenario cannot run in virtual time. No file is written.
-        LawFailed: A user's control law failed. The file contains the ticks before the failure.
-    """
-    with LogFile(path, force=force) as stream:
-        return write_virtual_log(
-            scenario,
-            stream,
-            stopped=stopped,
-            views_hz=views_hz,
-            hands=hands,
-            policies=policies,
-        )
-
-
 class SimulatedLog(Log):
     """Simulates a run in virtual time, and holds its log in memory.
 
@@ -713,6 +670,50 @@ class SimulatedLog(Log):
         """
         return cls(cut_to_records(log).without_hands())
 
+    @staticmethod
+    def record_scenario(
+        scenario: Scenario,
+        path: Path,
+        *,
+        force: bool = False,
+        stopped: Callable[[], bool] = lambda: False,
+        views_hz: float = VIZ_HZ,
+        hands: HandTracks = {},  # noqa: B006
+        policies: Collection[str] = (),
+    ) -> bool:
+        """Simulates a scenario faster than real time, and writes the log of the run to a file.
+
+        Args:
+            scenario: The scenario, with its sites and links.
+            path: File to which the log is written.
+            force: If True, an existing file is replaced.
+            stopped: Function that is called after each tick. The run ends if it returns True.
+            views_hz: Rate of the additional channels for viewers, in Hz.
+            hands: Actions of live operators, see `execute_virtual`.
+            policies: Sites whose live operator is a trained program. The log contains one event
+                for each.
+
+        Returns:
+            True if all sites stayed within their limits, False if one diverged.
+
+        Raises:
+            UsageError: The file exists, or cannot be created.
+            LogRefused: Writing to the disk failed. The error names the part of the log that is
+                kept.
+            ScenarioError: The scenario cannot run in virtual time. No file is written.
+            LawFailed: A user's control law failed. The file contains the ticks before the
+                failure.
+        """
+        with LogFile(path, force=force) as stream:
+            return write_virtual_log(
+                scenario,
+                stream,
+                stopped=stopped,
+                views_hz=views_hz,
+                hands=hands,
+                policies=policies,
+            )
+
     def save(self, path: str | Path, *, force: bool = False) -> Path:
         """Writes the log to a file, as `trilat sim -o` does.
 
@@ -730,10 +731,9 @@ class SimulatedLog(Log):
             UsageError: The file exists, or cannot be created.
             LogRefused: Writing to the disk failed.
         """
-        with LogFile(Path(path), force=force) as stream:
-            write_virtual_log(
-                self._simulated_scenario, stream, views_hz=VIZ_HZ, hands=self._hands
-            )
+        self.record_scenario(
+            self._simulated_scenario, Path(path), force=force, hands=self._hands
+        )
         return Path(path)
 
 

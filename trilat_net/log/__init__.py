@@ -60,6 +60,7 @@ __all__ = [
     "Finding",
     "Integrity",
     "LogCheckResult",
+    "LogQuality",
     "Recovery",
     "RecoverySurvey",
     "StartGap",
@@ -77,6 +78,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from .accounted_log import LogQuality
     from .accounting import (
         LAST,
         MIN_COVERAGE,
@@ -131,6 +133,7 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
+            "accounted_log": "LogQuality",
             "accounting": (
                 "Account Coverage LAST MIN_COVERAGE StartGap count_skipped_ticks "
                 "describe_unknown_ends"

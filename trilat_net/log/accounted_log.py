@@ -10,16 +10,32 @@ Invariant:
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import count_nouns
 from ..net import count_under_way, topics
-from .accounting import LAST, Account
+from .accounting import LAST, Account, Coverage
 from .decoded_log import DecodedLog
 from .log_layout import ACCOUNTS, EXECUTED_SITES_KEY, PART, RERUN_DRIVER, ChannelFilter
 from .running_digest import DigestState, Integrity
 from .session_accounts import SessionAccounts
+
+
+class LogQuality(NamedTuple):
+    """How much of a run a log shows, and whether the log can be trusted.
+
+    Attributes:
+        coverage: Recorded ticks and expected ticks of every site.
+        integrity: Whether the log is unmodified since it was written.
+        copied_sites: Sites that did not react to the other sites, because the run is a
+            repetition in which their motion was copied from an earlier run.
+    """
+
+    coverage: Coverage
+    integrity: Integrity
+    copied_sites: tuple[str, ...]
 
 
 class AccountedLog(DecodedLog):
@@ -359,6 +375,21 @@ class AccountedLog(DecodedLog):
                 possible_ticks = received_ticks[received_ticks < self.scenario.ticks(peer)]
                 last_ticks[peer] = int(possible_ticks.max(initial=last_ticks[peer]))
         return last_ticks
+
+    def judge_quality(self) -> LogQuality:
+        """Determines how much of the run was recorded, and whether the log was modified.
+
+        Raises:
+            LogError: A message cannot be decoded.
+        """
+        recorded_ticks = {site: len(np.unique(self[site].tick)) for site in self.sites}
+        expected_ticks = {site: self.expected_ticks(site) for site in self.sites}
+        executed_sites = self.executed_sites
+        return LogQuality(
+            coverage=Coverage(recorded_ticks, expected_ticks),
+            integrity=self.judge_integrity(),
+            copied_sites=tuple(site for site in self.sites if site not in executed_sites),
+        )
 
     def judge_integrity(self) -> Integrity:
         """Determines whether the log was modified after it was recorded.

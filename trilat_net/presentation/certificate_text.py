@@ -381,7 +381,7 @@ def _describe_evidence(certificate: Certificate) -> CertificateLine:
     """Returns a line that says whether the log is complete and intact."""
     evidence = certificate.evidence
     mark = "open" if evidence.reasons else "ok"
-    if not evidence.integrity.passed:
+    if not evidence.log.integrity.passed:
         mark = "FAIL"
     return CertificateLine(mark, f"log: {evidence.text}")
 

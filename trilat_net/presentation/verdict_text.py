@@ -176,7 +176,8 @@ def _describe_growth(growth: facts.UnsuppliedGrowth) -> str:
 
 def _describe_evidence(evidence: facts.Evidence) -> str:
     """Returns a sentence on how many records a run has, and whether its log is unchanged."""
-    return f"{evidence.coverage.describe(evidence.min_coverage)}; {evidence.integrity.text}"
+    coverage = evidence.log.coverage.describe(evidence.min_coverage)
+    return f"{coverage}; {evidence.log.integrity.text}"
 
 
 def _list_lacks(evidence: facts.Evidence) -> list[str]:
@@ -188,15 +189,16 @@ def _describe_lack(doubt: facts.EvidenceDoubt) -> str:
     """Returns a sentence on why the records are insufficient to judge a run."""
     evidence = doubt.evidence
     if doubt.name == "changed log":
-        return f"the log was changed after the run: {evidence.integrity.text}"
+        return f"the log was changed after the run: {evidence.log.integrity.text}"
     if doubt.name == "missing records":
-        coverage = evidence.coverage.describe(evidence.min_coverage)
+        coverage = evidence.log.coverage.describe(evidence.min_coverage)
         return f"records are missing: {coverage}"
     if doubt.name == "missing periods":
         judged_share = evidence.functional_share or 0.0
         return f"V is judged over {100.0 * judged_share:.4g} % of its periods"
     return (
-        f"{' and '.join(evidence.unmet)} replayed recorded motion, without reacting to this run"
+        f"{' and '.join(evidence.log.copied_sites)} replayed recorded motion, without reacting "
+        "to this run"
     )
 
 

@@ -33,7 +33,7 @@ from msgspec.structs import replace
 
 from trilat_net.core import POSITION, Array, HandView, SiteArrays, tick_ns
 from trilat_net.errors import UsageError, count_nouns
-from trilat_net.execution import FusedRun, record_virtual
+from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.files import Extra
 from trilat_net.log import expand_poses
 from trilat_net.scenario import (
@@ -925,7 +925,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         elapsed_s = self._k / self._tick_rate_hz
         scenario = replace(self.scenario, duration_s=elapsed_s)
         log_path = Path(path)
-        record_virtual(scenario, log_path, force=force, hands=hands, policies=[self.user])
+        SimulatedLog.record_scenario(
+            scenario, log_path, force=force, hands=hands, policies=[self.user]
+        )
         return log_path
 
 

@@ -335,7 +335,7 @@ def test_only_recorded_periods_count_for_v() -> None:
         make_log_bytes("free", RUN), record=drop_records("s", set(range(100, 3000, 1000)))
     )
     certificate = certify_bytes(data)
-    assert certificate.evidence.coverage.share == 0.999
+    assert certificate.evidence.log.coverage.share == 0.999
     assert certificate.evidence.functional_share is not None
     assert certificate.evidence.functional_share < 0.999
     assert any(why.startswith("V is judged over 99.") for why in certificate.reasons)

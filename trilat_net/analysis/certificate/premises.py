@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core import DominanceMatrix
-from ...log import Coverage, Log
+from ...log import Log
 from ...net import HALTED_MODES
 from ..aligned import Bools
 from ..dominance_history import (
@@ -229,7 +229,6 @@ class RunFacts(NamedTuple):
             min_coverage: Smallest acceptable fraction of ticks that were recorded, and of tick
                 periods in which the energy of the stability proof is known. Between 0 and 1.
         """
-        log = self.log
         facts = self.functional
         functional_share = None
         if facts is not None and not facts.groups:
@@ -242,14 +241,10 @@ class RunFacts(NamedTuple):
                 all_present &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)
             functional_share = float(judged[all_present].mean()) if all_present.any() else 0.0
 
-        recorded_ticks = {site: len(np.unique(log[site].tick)) for site in log.sites}
-        expected_ticks = {site: log.expected_ticks(site) for site in log.sites}
         return Evidence(
-            coverage=Coverage(recorded_ticks, expected_ticks),
+            log=self.log.judge_quality(),
             functional_share=functional_share,
             min_coverage=min_coverage,
-            integrity=log.judge_integrity(),
-            unmet=tuple(site for site in log.sites if site not in log.executed_sites),
         )
 
 

@@ -211,7 +211,7 @@ class Certificate(Result):
         """
         if self.verdict.finding is StabilityFinding.BROKEN:
             return False
-        if not self.evidence.integrity.passed:
+        if not self.evidence.log.integrity.passed:
             return False
         if "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED:
             return True

@@ -15,7 +15,7 @@ from enum import Enum, auto
 from typing import Any, Literal, NamedTuple
 
 from ...hooks import find_hook
-from ...log import Coverage, Integrity
+from ...log import LogQuality
 from .premise_quantities import MissingFunctional, PremiseQuantities
 
 
@@ -245,21 +245,16 @@ class Evidence(NamedTuple):
     """The records on which a stability certificate is based, and whether they are sufficient.
 
     Attributes:
-        coverage: Recorded ticks and expected ticks of every site.
+        log: Recorded ticks of every site, and whether the log was modified.
         functional_share: Fraction of the tick periods in which the energy of the stability
             proof is known from records, excluding periods in which a site was absent. `None` if
             this energy is not judged.
         min_coverage: Smallest sufficient fraction, for both ticks and periods.
-        integrity: Whether the log is unmodified since it was written.
-        unmet: Sites that did not react to the other sites, because the run is a repetition in
-            which their motion was copied from an earlier run.
     """
 
-    coverage: Coverage
+    log: LogQuality
     functional_share: float | None
     min_coverage: float
-    integrity: Integrity
-    unmet: tuple[str, ...] = ()
 
     @property
     def doubts(self) -> "tuple[EvidenceDoubt, ...]":
@@ -268,14 +263,14 @@ class Evidence(NamedTuple):
         Examples are a log that was modified after the run, or too many missing records.
         """
         doubts = []
-        if not self.integrity.passed:
+        if not self.log.integrity.passed:
             doubts.append(EvidenceDoubt("changed log", self))
-        if self.coverage.share < self.min_coverage:
+        if self.log.coverage.share < self.min_coverage:
             doubts.append(EvidenceDoubt("missing records", self))
         judged_share = self.functional_share
         if judged_share is not None and judged_share < self.min_coverage:
             doubts.append(EvidenceDoubt("missing periods", self))
-        if self.unmet:
+        if self.log.copied_sites:
             doubts.append(EvidenceDoubt("copied sites", self))
         return tuple(doubts)
 
@@ -303,12 +298,12 @@ class Evidence(NamedTuple):
         whether the log is unmodified.
         """
         return {
-            "coverage": self.coverage.share,
+            "coverage": self.log.coverage.share,
             "functional_coverage": self.functional_share,
             "min_coverage": self.min_coverage,
-            "judged": self.coverage.to_json(),
-            "integrity": self.integrity.state.name.lower(),
-            "open_loop_sites": list(self.unmet),
+            "judged": self.log.coverage.to_json(),
+            "integrity": self.log.integrity.state.name.lower(),
+            "open_loop_sites": list(self.log.copied_sites),
         }
 
 

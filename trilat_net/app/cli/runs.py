@@ -46,7 +46,7 @@ def sim_command(
 
     The result is the same kind of log that a live session writes.
     """
-    from ...execution import record_virtual
+    from ...execution import SimulatedLog
     from .options import parse_viz_rate
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -73,7 +73,7 @@ def sim_command(
         Interrupt(compiles=True) as interrupt,
         terminal.progress_lines(f"running {chosen.name} in virtual time"),
     ):
-        stayed_in_limits = record_virtual(
+        stayed_in_limits = SimulatedLog.record_scenario(
             chosen, path, force=force, stopped=interrupt.is_requested, views_hz=views_hz
         )
     if interrupt.is_requested():

@@ -29,7 +29,7 @@ from trilat_net.analysis import (
 )
 from trilat_net.core import Array
 from trilat_net.errors import LogError
-from trilat_net.execution import FusedRun, record_virtual, verify_log
+from trilat_net.execution import FusedRun, SimulatedLog, verify_log
 from trilat_net.files import digest_file
 from trilat_net.log import Ints, Log, SiteLog, open_log
 from trilat_net.records import NS_PER_S
@@ -622,7 +622,7 @@ class SyntheticTrial(ExperimentTrial):
         players = self._make_players(scenario)
         hands = {site: player.track for site, player in players.items()}
 
-        record_virtual(
+        SimulatedLog.record_scenario(
             scenario,
             path,
             force=True,

@@ -9,7 +9,7 @@ from trilat_studies.tuning.candidate import CLASS_MEANINGS, CandidateClass, chec
 
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.app.api import simulate
-from trilat_net.execution.virtual import record_virtual
+from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.log.log_reader import open_log
 
 CALM = make_run_end()
@@ -95,7 +95,9 @@ def test_arms_that_start_hanging_did_not_fall() -> None:
 
 def test_a_truncated_log_names_its_end(tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
-    assert record_virtual(make_trio_scenario(*FIRM_GAINS, "duration_s=40.0"), path)
+    assert SimulatedLog.record_scenario(
+        make_trio_scenario(*FIRM_GAINS, "duration_s=40.0"), path
+    )
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) * 3 // 5])
     (line,) = check_final_posture(open_log(path))
