@@ -79,7 +79,7 @@ def request_real_time_scheduling() -> str:
     """
     calling_thread = 0  # in system calls, 0 stands for the calling thread
     if sys.platform.startswith("linux"):
-        with suppress(OSError):  # not permitted
+        with suppress(OSError, AttributeError):  # not permitted, or not on this platform
             lower_priority = os.sched_param(FIFO_PRIORITY - 1)
             _change_threads(
                 lambda thread: os.sched_setscheduler(thread, os.SCHED_FIFO, lower_priority)
@@ -88,7 +88,7 @@ def request_real_time_scheduling() -> str:
             return f"SCHED_FIFO {FIFO_PRIORITY}"
 
     if sys.platform != "win32":
-        with suppress(OSError):  # not permitted
+        with suppress(OSError, AttributeError):  # not permitted, or not on this platform
             _change_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, LOOP_NICE))
             return f"nice {LOOP_NICE} (SCHED_FIFO was not permitted)"
 
