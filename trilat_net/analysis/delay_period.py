@@ -67,7 +67,7 @@ def find_link_period_s(link: LinkBase) -> float | None:
         The period, or `None` if the delay is constant, random or measured, or follows a trace
         that ends.
     """
-    if is_ending_trace(link):
+    if link.to_core_model().has_ending_trace:
         return None
     cycle = _find_cycle(link)
     return None if cycle is None else float(cycle)
@@ -165,7 +165,7 @@ class DelayPeriod(NamedTuple):
             ends.
         """
         for link in links:
-            if link.random or link.measured or is_ending_trace(link):
+            if link.random or link.measured or link.to_core_model().has_ending_trace:
                 return cls(None, None)
         cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
         true_period = _find_common_period(cycles, math.gcd(*rates_hz))
@@ -183,37 +183,9 @@ class DelayPeriod(NamedTuple):
         Args:
             scenario: The scenario.
         """
-        links = [find_final_link(scenario, name) for name in scenario.links]
+        links = [scenario.find_final_link(name) for name in scenario.links]
         rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
         return cls.of_links(links, rates_hz)
-
-
-def is_ending_trace(link: LinkBase) -> bool:
-    """Returns True if a link plays a delay trace that does not restart at its end.
-
-    The delay after the end is not a repetition, so the link has no period.
-
-    Args:
-        link: Delay model of the link.
-    """
-    return link.to_core_model().has_ending_trace
-
-
-def find_final_link(scenario: Scenario, name: str) -> LinkBase:
-    """Returns the delay model of a link in effect at the end of a scenario.
-
-    The linear analysis of a run uses this model, because it describes motion about the final
-    pose.
-
-    Args:
-        scenario: The scenario. Its timeline may change the link.
-        name: Name of the link, for example "m1->s".
-    """
-    end_ns = round(scenario.duration_s * 1e9)
-    link: LinkBase = scenario.links[name]
-    for from_ns, later_link in scenario.scheduled_links(name):
-        link = later_link if from_ns <= end_ns else link
-    return link
 
 
 def find_burst_interval_s(scenario: Scenario) -> float | None:
@@ -233,7 +205,7 @@ def find_burst_interval_s(scenario: Scenario) -> float | None:
     """
     intervals_s = []
     for name in scenario.links:
-        link = find_final_link(scenario, name)
+        link = scenario.find_final_link(name)
         if link.loss_burst <= 1.0 or not 0.0 < link.loss < link.loss_bad:
             continue
         leave_probability = 1.0 - (1.0 - 1.0 / link.loss_burst) / link.loss_bad

@@ -73,7 +73,7 @@ class _Messages(NamedTuple):
     size: "array[int]"
 
 
-class FileInventory:
+class _FileInventory:
     """Contents of one or several MCAP files: channels, message counts, times and damage.
 
     MCAP is the file format of the logs. Several files are treated as the parts of one log.
@@ -299,7 +299,7 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
             return None
         return lambda done, total: progress(number * total + done, 2 * total)
 
-    inventory = FileInventory(paths, report_pass(0))
+    inventory = _FileInventory(paths, report_pass(0))
     facts: JsonObject = {
         "files": inventory.files,
         "kind": "mcap",

@@ -20,7 +20,7 @@ from ..core import HELD_OVERRUN_TICKS, DelayKind, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log
 from ..net import MODES, ModeMeaning
-from ..scenario import Change, LinkBase
+from ..scenario import Change, LinkBase, Scenario
 
 
 class _AppliedChange(NamedTuple):
@@ -258,6 +258,20 @@ class Timeline:
             if is_command and has_effect:
                 effective_commands.append(change)
         return effective_commands
+
+    @property
+    def final_scenario(self) -> Scenario:
+        """The scenario of the log, with the users' commands of the run as planned changes.
+
+        Its duration is the recorded duration. The settings in effect at its end are therefore
+        those of the final control loop.
+        """
+        scenario = self._log.scenario
+        commands = [change for change in self.effective_commands if not change.order]
+        timeline = sorted([*scenario.timeline, *commands], key=lambda change: change.at_s)
+        return msgspec.structs.replace(
+            scenario, timeline=tuple(timeline), duration_s=self.end_s
+        )
 
     @cached_property
     def stated_links(self) -> dict[str, StatedLink]:

@@ -16,6 +16,7 @@ from ..hooks import import_on_use, register_hooks
 __all__ = [
     # Text
     "MARKS",
+    "NEGATIVE_ENERGY_MEANING",
     "Block",
     "MarkedText",
     "TextTable",
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
     from .figures.registry import FIGURES, figure, write_figures, write_overlay
     from .foxglove_layout import write_foxglove_layout
     from .linear_text import describe_moving_states
+    from .observed_text import NEGATIVE_ENERGY_MEANING
     from .rerun_viewer import ViewerOptions, open_rerun
     from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
@@ -91,6 +93,7 @@ else:
             "figures.registry": "FIGURES figure write_figures write_overlay",
             "foxglove_layout": "write_foxglove_layout",
             "linear_text": "describe_moving_states",
+            "observed_text": "NEGATIVE_ENERGY_MEANING",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable compose format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",

@@ -27,7 +27,6 @@ from trilat_net.analysis import (
     LogMetrics,
     Metric,
     RunEnd,
-    RunTrace,
     Stability,
     VirtualWall,
     build_arm_rows,
@@ -114,10 +113,10 @@ class RecordBatch(NamedTuple):
                 there are no earlier records.
 
         Returns:
-            The updated summary, see `RunTrace.reduce_records`.
+            The updated summary, see `RunEnd.reduce_records`.
         """
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
-        return RunTrace.reduce_records(
+        return RunEnd.reduce_records(
             bucket=bucket,
             e=self.e,
             qd=self.qd,
@@ -416,8 +415,8 @@ def _join_run(
         records[name] = site_records
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
-    trace = RunTrace(buckets, last_tau_x, run.diverged_s)
-    return WholeRun(records, trace.classify_end(scenario), run)
+    end = RunEnd.of_reduced_records(scenario, buckets, last_tau_x, run.diverged_s)
+    return WholeRun(records, end, run)
 
 
 class Range(NamedTuple):
@@ -978,7 +977,6 @@ def _compute_run_metrics(
         buckets.append(stats.buckets)
         last_tau_x.append(stats.tau_x)
     all_ran = len(with_records) == len(site_stats)
-    trace = RunTrace(buckets, last_tau_x, diverged_at_s)
 
     synchronised_at_s = None
     if all_ran:
@@ -1014,7 +1012,7 @@ def _compute_run_metrics(
 
     return RunMetrics(
         simulated_s=max(durations_s, default=0.0),
-        end=trace.classify_end(scenario),
+        end=RunEnd.of_reduced_records(scenario, buckets, last_tau_x, diverged_at_s),
         synchronised_at_s=synchronised_at_s,
         peak_error_rad=find_largest("peak_error_rad"),
         rms_error_rad=find_largest("rms_error_rad"),
