@@ -22,9 +22,9 @@ from unittest import mock
 import numpy as np
 
 from tests.live.processes import PLAIN, Process, Stage, list_descendants
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.waiting import until
 from trilat_net.log.log_reader import open_log
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.process import FIFO_PRIORITY
 
 from .live import cyclictest_us, thread_us

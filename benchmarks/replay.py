@@ -13,11 +13,11 @@ from typing import Any
 
 import msgspec
 
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.execution import virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.membership import liveliness_token, new_boot
 from trilat_net.net.messages import Event, Info
 from trilat_net.net.wire import encode

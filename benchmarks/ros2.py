@@ -8,8 +8,8 @@ import numpy as np
 import zenoh
 
 from tests.live.processes import connection_options
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net import open_log
-from trilat_net.net.connection import find_free_endpoints
 
 from .sessions import SITES, paper
 from .stopwatch import cpu_s

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.net import topics
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.member_keys import create_keys, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 

@@ -12,7 +12,6 @@ from trilat_net.hooks import import_on_use
 
 __all__ = [
     "SiteOptions",
-    "check_machine_load",
     "rehearse_loop",
     "run_hand",
     "run_site",
@@ -22,7 +21,6 @@ __all__ = [
 if TYPE_CHECKING:
     from .hand_process import run_hand
     from .loop_rehearsal import rehearse_loop
-    from .machine_load import check_machine_load
     from .site_parts import SiteOptions, warm_up
     from .site_process import run_site
 else:
@@ -31,7 +29,6 @@ else:
         {
             "hand_process": "run_hand",
             "loop_rehearsal": "rehearse_loop",
-            "machine_load": "check_machine_load",
             "site_parts": "SiteOptions warm_up",
             "site_process": "run_site",
         },

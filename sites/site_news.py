@@ -16,7 +16,6 @@ import numpy as np
 from trilat_net.core import (
     LifeAlarm,
     LifeReason,
-    StaleAction,
     describe_mode,
     tick_ns,
 )
@@ -88,7 +87,7 @@ class SiteNews:
             text = describe_mode(
                 parts.name,
                 output,
-                glides=parts.setup.on_stale.action is StaleAction.GLIDE,
+                glides=parts.setup.on_stale.glides,
                 law_failure=parts.site.law_failure,
             )
             self._publisher.publish("mode", text, t_ns=output.t_ns, ticks=output.tick)
@@ -113,7 +112,7 @@ class SiteNews:
                 return
             self._alarm_s = second
 
-        if rule.action is not StaleAction.GLIDE:
+        if not rule.glides:
             return
 
         # Some arms continue without a lost peer. For them, an alarm is raised when they return
@@ -200,7 +199,7 @@ class SiteNews:
         """
         if output.mode not in (Mode.WAITING, Mode.HOLD):
             return
-        if self._parts.setup.on_stale.action is not StaleAction.GLIDE:
+        if not self._parts.setup.on_stale.glides:
             return
 
         second = output.t_ns // NS_PER_S

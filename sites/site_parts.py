@@ -16,7 +16,6 @@ from typing import Any
 
 from trilat_net.core import (
     CoreChange,
-    DelayKind,
     PlantState,
     Site,
     SiteSetup,
@@ -403,12 +402,7 @@ def _may_hold_samples(scenario: Scenario, name: str) -> bool:
                 continue
             # The models replace each other in the course of the run.
             for model in link.models:
-                is_constant = model.kind == DelayKind.CONSTANT
-                # A random delay may be as short as 0.
-                smallest_network_us = model.location if is_constant else 0.0
-                # The play-out buffer holds each sample until it has at least a given age.
-                smallest_delay_us = max(model.playout_us, smallest_network_us)
-                if smallest_delay_us < _MIN_HELD_DELAY_US:
+                if model.least_us < _MIN_HELD_DELAY_US:
                     return False
     return True
 

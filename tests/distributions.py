@@ -10,7 +10,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 from tests.programs import run_program
-from trilat_net.files import STUDY_LIBRARIES
+from trilat_net.package_names import STUDY_LIBRARIES
 
 ROOT = Path(__file__).parents[1]
 CORE = "trilat-net-core"

@@ -24,7 +24,6 @@ from sites import (
     change_server,
     code_watchdog,
     external_arm,
-    machine_load,
     retransmit_buffer,
     site_end,
 )
@@ -46,6 +45,7 @@ from trilat_net.analysis.theory import (
     port_response,
 )
 from trilat_net.analysis.twins import envelope_trend, twin_growth
+from trilat_net.app import machine_load
 from trilat_net.app.play import player
 from trilat_net.core.life import live_hand, session_life
 from trilat_net.core.links import delay, link

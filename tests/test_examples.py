@@ -21,8 +21,7 @@ from tests.log.builders import make_log_bytes, write_log
 from tests.net.waiting import sleep_for_ns, until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reach_session
-from trilat_net.app.running_session import open_hand
+from tests.sites.sessions import Session, reach_session
 from trilat_net.log.ros2.topic_names import TopicTable
 from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
@@ -296,8 +295,8 @@ def test_programs_hand_over_without_a_step(
         running = reach_session(bus, clock)
         wait_s(1.0)
         with (
-            open_hand(bus, clock, SESSION, "m2", scenario) as program,
-            open_hand(bus, clock, SESSION, "m1", scenario) as person,
+            running.open_hand(bus, "m2", scenario) as program,
+            running.open_hand(bus, "m1", scenario) as person,
         ):
             moved = example["lead"](
                 running, program, person, 9.0, lambda: 1e-9 * clock.monotonic_ns(), wait_s
@@ -324,8 +323,8 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
 
         with (
             reach_session(bus, clock) as running,
-            open_hand(bus, clock, SESSION, "m1", scenario) as hand,
-            open_hand(bus, clock, SESSION, "m2", scenario) as follower,
+            running.open_hand(bus, "m1", scenario) as hand,
+            running.open_hand(bus, "m2", scenario) as follower,
         ):
             for seconds in (4.0, 0.04):
                 outcomes.extend(

@@ -22,7 +22,7 @@ from trilat_net.app.api import choose_report_folder
 from trilat_net.app.demo_session import create_file
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import (
-    format_extra_install,
+    Extra,
     make_folder,
     make_results_folder,
     open_regular,
@@ -31,8 +31,9 @@ from trilat_net.files import (
     write_whole,
 )
 from trilat_net.log.log_file import LogFile, sync_folder
+from trilat_net.package_names import EXTRAS, STUDY_LIBRARIES, describe_missing_library
 from trilat_net.presentation.export import EXPORT_MANIFEST
-from trilat_net.work.study_folder import RunJournal
+from trilat_net.work.run_journal import RunJournal
 
 
 def read_folder(folder: Path) -> dict[str, str]:
@@ -283,15 +284,15 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_an_installed_program_names_pip(program: Path) -> None:
     assert program.is_dir()
-    assert format_extra_install("view") == "pip install 'trilat-net[view]'"
+    assert Extra("view").install_command == "pip install 'trilat-net[view]'"
 
 
 def test_a_clone_names_its_makefile(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_clone(program)
     monkeypatch.setattr(sys, "prefix", str(program / ".venv"))
-    assert format_extra_install("view") == f"make -C {program} extras EXTRAS=view"
+    assert Extra("view").install_command == f"make -C {program} extras EXTRAS=view"
     monkeypatch.chdir(program)
-    assert format_extra_install("view") == "make extras EXTRAS=view"
+    assert Extra("view").install_command == "make extras EXTRAS=view"
 
 
 def test_a_clone_in_another_environment_names_pip(
@@ -300,7 +301,7 @@ def test_a_clone_in_another_environment_names_pip(
     make_clone(program)
     monkeypatch.setattr(sys, "prefix", "/opt/lab")
     monkeypatch.setattr(sys, "executable", "/opt/lab/bin/python")
-    hint = format_extra_install("view")
+    hint = Extra("view").install_command
     assert hint == f"/opt/lab/bin/python -m pip install -e '{program}[view]'"
 
 
@@ -308,11 +309,11 @@ def test_every_named_extra_can_be_installed() -> None:
     named = {
         keyword
         for file in house.files()
-        for keyword in re.findall(
-            r'import_extra\("[\w.]+", "(\w+)"', file.read_text(encoding="utf-8")
-        )
+        for keyword in re.findall(r'\bExtra\("(\w+)"', file.read_text(encoding="utf-8"))
     }
-    assert {"view", "frames", "cluster", "stats"} <= named <= list_extras().keys()
+    without_packages = {"mat"}  # SciPy comes with the program
+    assert {"view", "frames", "cluster", "stats"} <= named
+    assert named <= list_extras().keys() | without_packages
 
 
 @pytest.mark.parametrize("text", ["view", "view,frames", "view frames", " view , frames "])
@@ -353,19 +354,19 @@ def test_optional_libraries_have_an_installing_extra() -> None:
     declared = {
         re.split("[><=]", package)[0]: name for name in extras for package in extras[name]
     }
-    named = {packages.get(library, library): extra for library, extra in files.EXTRAS.items()}
+    named = {packages.get(library, library): extra for library, extra in EXTRAS.items()}
     assert named == declared
 
 
-@pytest.mark.parametrize("library", [*files.EXTRAS, *files.STUDY_LIBRARIES, "somewhere"])
+@pytest.mark.parametrize("library", [*EXTRAS, *STUDY_LIBRARIES, "somewhere"])
 def test_the_remedy_for_a_missing_library_installs_it(library: str) -> None:
     error = ModuleNotFoundError(f"No module named {library}.deeper", name=f"{library}.deeper")
-    text = files.describe_missing_library("make_env", error)
+    text = describe_missing_library("make_env", error)
     assert text.startswith(f"make_env needs {library}, ")
     remedy = f"pip install {library}"
-    if library in files.EXTRAS:
-        remedy = format_extra_install(files.EXTRAS[library])
-    elif library in files.STUDY_LIBRARIES:
+    if library in EXTRAS:
+        remedy = Extra(EXTRAS[library]).install_command
+    elif library in STUDY_LIBRARIES:
         remedy = "pip install trilat-net"
     assert text.endswith(remedy)
 
@@ -406,8 +407,8 @@ def test_without_a_library_only_dependents_are_missing(
     lines = done.stdout.splitlines()
     assert {line.split()[0] for line in lines} == functions, done
     remedy = "pip install trilat-net"
-    if library in files.EXTRAS:
-        remedy = format_extra_install(files.EXTRAS[library])
+    if library in EXTRAS:
+        remedy = Extra(EXTRAS[library]).install_command
     assert all(f" {library}" in line and line.endswith(remedy) for line in lines)
 
 
@@ -419,9 +420,9 @@ def test_missing_libraries_of_libraries_are_distinguished(
     with pytest.raises(
         UsageError, match="viewers need optional_thing, which needs that_is_nowhere: "
     ):
-        files.import_extra("optional_thing", "view", "viewers")
+        Extra("view", "viewers").import_module("optional_thing")
     with pytest.raises(UsageError, match="viewers need not_there_at_all: "):
-        files.import_extra("not_there_at_all", "view", "viewers")
+        Extra("view", "viewers").import_module("not_there_at_all")
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "run", "a.b.mcap", "run.mcap.active", ".run"])

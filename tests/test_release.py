@@ -26,7 +26,7 @@ from tests.distributions import (
     make_sources,
     run_outside,
 )
-from trilat_net.net.connection import find_free_endpoints
+from tests.net.free_endpoints import find_free_endpoints
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -189,7 +189,7 @@ def _import_name(name: str) -> _Any:
     except UsageError as error:
         return _make_stand_in(name, str(error))
     except ModuleNotFoundError as error:
-        from .files import describe_missing_library
+        from .package_names import describe_missing_library
 
         return _make_stand_in(name, describe_missing_library(name, error))
 

@@ -26,139 +26,71 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module, metadata
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from .errors import LogError, LogRefused, TrilatError, UsageError
-from .package_names import PACKAGE_COMMANDS
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 """Error numbers that indicate that a disk accepts no more data, for example because it is full.
 """
-STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
-"""Libraries that are installed with `trilat-net` but not with `trilat-net-core`
-(pyproject.toml).
-"""
-
-EXTRAS = {
-    "dask": "cluster",
-    "distributed": "cluster",
-    "gymnasium": "gym",
-    "mujoco": "sim",
-    "pandas": "frames",
-    "polars": "frames",
-    "pyarrow": "lerobot",
-    "rerun": "view",
-    "statsmodels": "stats",
-}
-"""Mapping from optional library to the extra of trilat-net that installs it (pyproject.toml).
-"""
 
 
-def require_libraries(*names: str) -> None:
-    """Raises UsageError if a library required by a command is not installed.
+class Extra(NamedTuple):
+    """A group of optional packages, which users install as in `pip install trilat-net[view]`.
 
-    Called at the start of a long command, which would otherwise fail only at its end, for
-    example when drawing a figure.
-
-    Args:
-        names: Names of the libraries. Defaults to all of `STUDY_LIBRARIES`.
-
-    Raises:
-        UsageError: A library is not installed. The message contains the command that installs
-            it.
+    Attributes:
+        name: Name of the group, such as "view" (see `package_names.EXTRAS`).
+        purpose: The features that need the packages, in the plural, for error messages.
     """
-    required = names or STUDY_LIBRARIES
-    missing = [name for name in required if find_spec(name) is None]
-    if missing:
-        libraries = ", ".join(missing)
-        raise UsageError(
-            f"this command needs {libraries}, which trilat-net-core does not include: "
-            "pip install trilat-net"
-        )
 
+    name: str
+    purpose: str = "these features"
 
-def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
-    """Returns the error message for a function whose library is not installed.
+    def import_module(self, module: str) -> Any:
+        """Imports a module of the group, which may not be installed.
 
-    Args:
-        function: Name of the function.
-        error: The import error, which names the missing module.
+        If the package is missing, the user gets an error that contains the install command,
+        instead of a traceback.
 
-    Returns:
-        The message, including the command that installs the library.
+        Args:
+            module: Name of the module.
 
-    Raises:
-        ModuleNotFoundError: The missing module belongs to this program, which is a bug.
-    """
-    package = (error.name or "").partition(".")[0]
-    if package in ("", "recorder", "sites", "trilat_net"):
-        raise error
-    distribution = package.replace("_", "-")
-    if distribution in PACKAGE_COMMANDS:
-        remedy = f"a separate package: pip install {distribution}"
-    elif package in STUDY_LIBRARIES:
-        remedy = "which trilat-net-core does not include: pip install trilat-net"
-    elif package in EXTRAS:
-        remedy = f"which is not installed: {format_extra_install(EXTRAS[package])}"
-    else:
-        # A library that every installation of this program has, or that another library needs.
-        remedy = f"which is not installed: pip install {package}"
-    return f"{function} needs {package}, {remedy}"
+        Raises:
+            UsageError: The package is not installed. The message contains the command that
+                installs it.
+        """
+        try:
+            return import_module(module)
+        except ImportError as error:
+            package = module.partition(".")[0]
+            # The package may be installed, but not a library that it needs itself.
+            missing = (error.name or package).partition(".")[0]
+            need = package if missing == package else f"{package}, which needs {missing}"
+            raise UsageError(f"{self.purpose} need {need}: {self.install_command}") from None
 
+    @property
+    def install_command(self) -> str:
+        """Shell command that installs the group in the current environment.
 
-def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Imports a module of an optional package, which may not be installed.
+        - In the `.venv` of a repository clone, the command is a target of the clone's Makefile,
+          which installs locked versions.
+        - In any other environment that uses a clone, the command is pip with the path of the
+          clone.
+        - Otherwise, the command is pip with the name of the distribution.
+        """
+        clone = Path(__file__).resolve().parents[1]
+        is_clone = all((clone / name).is_file() for name in ("Makefile", "pyproject.toml"))
+        if not is_clone:
+            return f"pip install 'trilat-net[{self.name}]'"
 
-    If the package is missing, the user gets an error that contains the install command, instead
-    of a traceback.
+        is_environment_of_clone = Path(sys.prefix).resolve() == clone / ".venv"
+        if not is_environment_of_clone:
+            requirement = f"{clone}[{self.name}]"
+            return shlex.join([sys.executable, "-m", "pip", "install", "-e", requirement])
 
-    Args:
-        module: Name of the module.
-        extra: Name of the extra of trilat-net that installs the package, as in
-            `trilat-net[extra]`.
-        purpose: The features that need the package, in the plural, for the error message.
-
-    Returns:
-        The module.
-
-    Raises:
-        UsageError: The package is not installed. The message contains the command that installs
-            it.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        package = module.partition(".")[0]
-        # The package may be installed, but not a library that it needs itself.
-        missing = (error.name or package).partition(".")[0]
-        need = package if missing == package else f"{package}, which needs {missing}"
-        raise UsageError(f"{purpose} need {need}: {format_extra_install(extra)}") from None
-
-
-def format_extra_install(extra: str) -> str:
-    """Returns the shell command that installs an extra in the current environment.
-
-    - In the `.venv` of a repository clone, the command is a target of the clone's Makefile,
-      which installs locked versions.
-    - In any other environment that uses a clone, the command is pip with the path of the clone.
-    - Otherwise, the command is pip with the name of the distribution.
-
-    Args:
-        extra: Name of the extra, a group of optional packages, as in `trilat-net[extra]`.
-    """
-    clone = Path(__file__).resolve().parents[1]
-    is_clone = all((clone / name).is_file() for name in ("Makefile", "pyproject.toml"))
-    if not is_clone:
-        return f"pip install 'trilat-net[{extra}]'"
-
-    is_environment_of_clone = Path(sys.prefix).resolve() == clone / ".venv"
-    if not is_environment_of_clone:
-        return shlex.join([sys.executable, "-m", "pip", "install", "-e", f"{clone}[{extra}]"])
-
-    change_folder = [] if Path.cwd() == clone else ["-C", str(clone)]
-    return shlex.join(["make", *change_folder, "extras", f"EXTRAS={extra}"])
+        change_folder = [] if Path.cwd() == clone else ["-C", str(clone)]
+        return shlex.join(["make", *change_folder, "extras", f"EXTRAS={self.name}"])
 
 
 def find_version() -> str:

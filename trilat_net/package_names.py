@@ -1,9 +1,15 @@
-"""Lists the commands and functions of the optional packages, such as trilat-studies.
+"""Lists optional packages and libraries, and explains which installation lacks one.
 
 If a user calls `trilat sweep` and trilat-studies is not installed, the program needs to
 recognise the command to tell the user what to install. The lists also define the order of the
 commands in the help. The packages register the commands themselves (see `entry_points`).
+
+Invariant:
+    - Importing this module loads no other module of the program, because `import trilat_net`
+      imports this one.
 """
+
+from importlib.util import find_spec
 
 PACKAGE_COMMANDS = {
     "trilat-people": {
@@ -49,3 +55,77 @@ PACKAGE_FUNCTIONS = {
 """Names that each package defines in `trilat_net`, separated by spaces."""
 PACKAGE_HOOKS = {"trilat-people": "device-hand"}
 """Functions of each package that are called by methods of this program, separated by spaces."""
+STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
+"""Libraries that are installed with `trilat-net` but not with `trilat-net-core`
+(pyproject.toml).
+"""
+
+EXTRAS = {
+    "dask": "cluster",
+    "distributed": "cluster",
+    "gymnasium": "gym",
+    "mujoco": "sim",
+    "pandas": "frames",
+    "polars": "frames",
+    "pyarrow": "lerobot",
+    "rerun": "view",
+    "statsmodels": "stats",
+}
+"""Mapping from optional library to the extra of trilat-net that installs it (pyproject.toml).
+"""
+
+
+def require_libraries(*names: str) -> None:
+    """Raises UsageError if a library required by a command is not installed.
+
+    Called at the start of a long command, which would otherwise fail only at its end, for
+    example when drawing a figure.
+
+    Args:
+        names: Names of the libraries. Defaults to all of `STUDY_LIBRARIES`.
+
+    Raises:
+        UsageError: A library is not installed. The message contains the command that installs
+            it.
+    """
+    from .errors import UsageError
+
+    required = names or STUDY_LIBRARIES
+    missing = [name for name in required if find_spec(name) is None]
+    if missing:
+        libraries = ", ".join(missing)
+        raise UsageError(
+            f"this command needs {libraries}, which trilat-net-core does not include: "
+            "pip install trilat-net"
+        )
+
+
+def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
+    """Returns the error message for a function whose library is not installed.
+
+    Args:
+        function: Name of the function.
+        error: The import error, which names the missing module.
+
+    Returns:
+        The message, including the command that installs the library.
+
+    Raises:
+        ModuleNotFoundError: The missing module belongs to this program, which is a bug.
+    """
+    from .files import Extra
+
+    package = (error.name or "").partition(".")[0]
+    if package in ("", "recorder", "sites", "trilat_net"):
+        raise error
+    distribution = package.replace("_", "-")
+    if distribution in PACKAGE_COMMANDS:
+        remedy = f"a separate package: pip install {distribution}"
+    elif package in STUDY_LIBRARIES:
+        remedy = "which trilat-net-core does not include: pip install trilat-net"
+    elif package in EXTRAS:
+        remedy = f"which is not installed: {Extra(EXTRAS[package]).install_command}"
+    else:
+        # A library that every installation of this program has, or that another library needs.
+        remedy = f"which is not installed: pip install {package}"
+    return f"{function} needs {package}, {remedy}"

@@ -78,21 +78,21 @@ def request_real_time_scheduling() -> str:
         Description of the scheduling that was obtained, for example "SCHED_FIFO 50".
     """
     calling_thread = 0  # in system calls, 0 stands for the calling thread
-    try:
-        lower_priority = os.sched_param(FIFO_PRIORITY - 1)
-        _change_threads(
-            lambda thread: os.sched_setscheduler(thread, os.SCHED_FIFO, lower_priority)
-        )
-        os.sched_setscheduler(calling_thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
-        return f"SCHED_FIFO {FIFO_PRIORITY}"
-    except (OSError, AttributeError):
-        pass  # not permitted, or not on this platform
+    if sys.platform.startswith("linux"):
+        with suppress(OSError):  # not permitted
+            lower_priority = os.sched_param(FIFO_PRIORITY - 1)
+            _change_threads(
+                lambda thread: os.sched_setscheduler(thread, os.SCHED_FIFO, lower_priority)
+            )
+            os.sched_setscheduler(calling_thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+            return f"SCHED_FIFO {FIFO_PRIORITY}"
 
-    try:
-        _change_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, LOOP_NICE))
-        return f"nice {LOOP_NICE} (SCHED_FIFO was not permitted)"
-    except (OSError, AttributeError):
-        return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
+    if sys.platform != "win32":
+        with suppress(OSError):  # not permitted
+            _change_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, LOOP_NICE))
+            return f"nice {LOOP_NICE} (SCHED_FIFO was not permitted)"
+
+    return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
 
 
 def _change_threads(change: Callable[[int], None]) -> None:
@@ -128,7 +128,9 @@ def raise_priority(nice: int) -> bool:
         True if the calling thread has the requested priority.
     """
     threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
-    if not (sys.platform.startswith("linux") and threads_folder.is_dir()):
+    if not sys.platform.startswith("linux"):
+        return False
+    if not threads_folder.is_dir():
         return False
 
     calling_thread = threading.get_native_id()
@@ -154,6 +156,6 @@ def _raise_session_priority(nice: int) -> None:
     session. If another process, for example a shell, leads the session, nothing is changed,
     because this would also affect its other processes.
     """
-    if os.getsid(0) == os.getpid():
+    if sys.platform.startswith("linux") and os.getsid(0) == os.getpid():
         with suppress(OSError):  # not permitted, or the system has no such groups
             Path("/proc/self/autogroup").write_text(f"{nice}\n", "ascii", newline="\n")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import pandas
 
-from .files import import_extra
+from .files import Extra
 from .hooks import find_hook
 
 _REPR_LENGTH = 200
@@ -62,7 +62,7 @@ class Result:
         Raises:
             UsageError: pandas is not installed.
         """
-        pandas = import_extra("pandas", "frames", "data frames")
+        pandas = Extra("frames", "data frames").import_module("pandas")
         return pandas.DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:

@@ -143,7 +143,7 @@ def test_a_site_that_nobody_follows_has_no_weight() -> None:
 
 
 def test_two_groups_that_follow_nobody_outside_are_named() -> None:
-    assert DominanceMatrix(PAIRS).find_closed_groups() == ((0, 1), (2, 3))
+    assert DominanceMatrix(PAIRS).closed_groups == ((0, 1), (2, 3))
 
 
 @pytest.mark.parametrize("mem", [[], [0.5] * 11])

@@ -16,7 +16,7 @@ import typer
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import TextTable
 from ...work.executor import WorkerPool
-from ...work.study_folder import RunJournal
+from ...work.run_journal import RunJournal
 from . import options
 
 

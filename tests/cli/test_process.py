@@ -12,13 +12,13 @@ import pandas
 import pytest
 
 from tests.cli.running import start_command
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.waiting import until
 from tests.other_systems import prepare_process, replace_os
 from trilat_net import __main__
 from trilat_net.app import cli
-from trilat_net.files import STUDY_LIBRARIES
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.package_names import STUDY_LIBRARIES
 from trilat_net.scenario.scenario_reader import read_template
 
 from .running import PLAIN, trilat
@@ -50,6 +50,7 @@ import sys, threading
 from trilat_net import __main__
 from trilat_net.app import cli
 from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.package_names import STUDY_LIBRARIES
 called = threading.Event()
 def take(key, payload):
     called.set()

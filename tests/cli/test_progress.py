@@ -12,7 +12,6 @@ import pytest
 from rich.console import Console
 
 from tests.cli.running import simulate_by_command
-from trilat_net.app.cli import run_progress
 from trilat_net.presentation import terminal_output
 
 from .running import trilat
@@ -106,7 +105,7 @@ def test_work_that_grows_prints_further_lines(monkeypatch: pytest.MonkeyPatch) -
     """A sweep is refined in steps, each of which adds runs to those that were planned."""
     make_terminal(monkeypatch, interactive=False)
     lines: list[str] = []
-    with run_progress.show_progress("sweeping", lines.append) as show:
+    with terminal_output.show_progress("sweeping", lines.append) as show:
         for first, total in ((0, 100), (100, 300)):
             for done in range(first, total + 1):
                 show(done, total)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from trilat_net.net.connection import find_free_endpoints
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 
 from .running import trilat

@@ -9,8 +9,8 @@ import pytest
 from tests.unit_arm import CLAMP, H50, make_spring_hand, make_unit_scenario, read_last_rows
 from trilat_net.analysis.arm_rows import PlacedArm
 from trilat_net.core.arms.elementary import tanh
+from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.errors import ScenarioError
-from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
 
 SATURATED = {"law": "saturated_pd", "K": 100.0, "P": 5.0, "d": 20.0}
@@ -118,7 +118,7 @@ def test_users_share_authority_and_feel_no_environment() -> None:
     }
     shares = {
         i: {j: x for j, x in zip(TRIO, row, strict=True) if i != j}
-        for i, row in zip(TRIO, complementary_shares(0.75).tolist(), strict=True)
+        for i, row in zip(TRIO, DominanceMatrix.complementary(0.75).alpha.tolist(), strict=True)
     }
     law = {"law": "authority", "K": 100.0, "d": 20.0}
     for wall, slave in (([], 0.15), ([CLAMP], 15.0 / 1100.0)):

@@ -26,8 +26,9 @@ from tests.unit_arm import (
 )
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
+from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.errors import ScenarioError
-from trilat_net.laws.six_channel import complementary_shares, complementary_weights
+from trilat_net.laws.six_channel import complementary_weights
 from trilat_net.scenario import Scenario
 
 SHARED = {  # factor: user 1 and user 2 at 0.1 and 1 Hz without and with qdd; rightmost root; beta_s / beta
@@ -79,7 +80,7 @@ def test_tables_of_documentation_have_these_numbers() -> None:
 def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> Scenario:
     hands = [[DRIVE] if driven == n else [] for n in (0, 1)]
     names = ("u1", "u2", "s")
-    alpha = complementary_shares(a).tolist()
+    alpha = DominanceMatrix.complementary(a).alpha.tolist()
     shares = {
         i: {j: x for j, x in zip(names, row, strict=True) if j != i}
         for i, row in zip(names, alpha, strict=True)
@@ -117,7 +118,7 @@ def test_two_sites_transmit_as_published(variant: str, delay_s: float) -> None:
 
 @pytest.mark.parametrize("a", SHARED)
 def test_the_dominance_factor_shares_felt_forces(a: float) -> None:
-    alpha = complementary_shares(a)
+    alpha = DominanceMatrix.complementary(a).alpha
     *users, root, ratios = SHARED[a]
     for at, values in enumerate(users):
         felt_ratios = [
@@ -191,7 +192,7 @@ def test_full_acceleration_one_tick_late_is_unstable() -> None:
 def test_the_linear_loop_has_the_law_without_acceleration() -> None:
     loop = LinearAnalysis.compute(three_sites(0.25, 5), pose=(0.0, 0.0)).loop
     A = loop.set_common_delay(0.0).A
-    alpha = complementary_shares(0.25)
+    alpha = DominanceMatrix.complementary(0.25).alpha
     assert np.linalg.eigvals(A).real.max() == pytest.approx(
         rightmost_root(alpha, [(0.0, 0.0), (0.0, 0.0), (500.0, 5.0)]), abs=1e-6
     )

@@ -20,7 +20,6 @@ from trilat_net.core.step.site_setup import (
     Gains,
     Law,
     LinkSetup,
-    Scheme,
     SiteSetup,
     TaskSetup,
 )
@@ -106,7 +105,7 @@ def make_task_arrays(task: TaskSetup) -> SiteArrays:
         SiteSetup(
             name="a",
             rate_hz=1000,
-            scheme=Scheme.SECOND_ORDER,
+            digital=False,
             gains=Gains(Law.ADAPTIVE, Lambda=(2.0,), Kp=(1.0,), Kd=(1.0,)),
             qd_limit_rad_s=100.0,
             q0=(0.0, -0.4, 0.2, -1.7, 0.1, 1.5, 0.3),

@@ -13,7 +13,7 @@ from tests.core.chain_references import (
 from trilat_net.core.arms.chain import ChainJoint
 from trilat_net.core.arms.chain_stages import place_chain, update_errors, update_torque
 from trilat_net.core.step.site_arrays import SiteArrays
-from trilat_net.core.step.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup
+from trilat_net.core.step.site_setup import ChainSetup, Gains, Law, LinkSetup, SiteSetup
 from trilat_net.core.step.vectors import Array
 
 REFERENCES = chain_references()
@@ -35,7 +35,7 @@ def build_arrays(name: str, state: ChainState, **gains: object) -> SiteArrays:
         SiteSetup(
             name="a",
             rate_hz=1000,
-            scheme=Scheme.SECOND_ORDER,
+            digital=False,
             theta=theta,
             g_m_s2=0.0,
             lengths_m=(0.0, 0.0),

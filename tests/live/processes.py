@@ -12,13 +12,13 @@ import numpy as np
 
 from tests.cli.running import COMMAND, PLAIN
 from tests.faults.invariants import SILENT_TICKS, count_silence, split_stretches
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.waiting import sleep_for_ns, until
 from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.own_code.code_consent import allow_own_code
 
 PAPER = ("m1", "m2", "s")

@@ -10,9 +10,9 @@ import pytest
 
 import recorder.record_process
 from tests.cli.running import trilat
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.execution.virtual import record_virtual
 from trilat_net.log.log_writer import LogStorage
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.scenario import load_scenario
 
 from .processes import Session, Stage

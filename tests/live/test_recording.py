@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from tests.live.processes import assert_executed_again, open_whole_log
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.waiting import sleep_for_ns, until
 from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import find_free_endpoints
 
 from .processes import Process, Session, Stage
 

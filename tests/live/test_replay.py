@@ -7,11 +7,11 @@ import pytest
 
 from tests.live.processes import assert_executed_again
 from tests.log.builders import make_log_bytes, write_log
+from tests.net.free_endpoints import find_free_endpoints
 from tests.recorder.play.logs import read_session_payloads
 from tests.sites.sessions import Session as Sites
 from tests.sites.sessions import make_gliding_scenario
 from trilat_net.log.log_reader import open_log
-from trilat_net.net.connection import find_free_endpoints
 
 from .processes import Process, Session, Stage
 

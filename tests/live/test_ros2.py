@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import trilat_net as tn
 from tests.live.processes import assert_executed_again, connection_options, open_whole_log
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.waiting import until
-from trilat_net.net.connection import find_free_endpoints
 
 from .processes import OUTSIDE, PAPER, Session, Stage, assert_let_go, pause
 

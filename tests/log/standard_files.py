@@ -13,7 +13,7 @@ from trilat_net.log.recovery import recover
 from trilat_net.log.ros2.viz_channels import offer_views
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode, encode_state
-from trilat_net.presentation.exports.ros2 import export_ros2
+from trilat_net.presentation.export import Exporter
 from trilat_net.scenario import load_scenario
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -103,6 +103,6 @@ def write_standard_files(folder: Path) -> dict[str, Path]:
     recovered = folder / "recovered.mcap"
     recover(torn, recovered)
     bag = folder / "live-ros2.mcap"
-    export_ros2(open_log(live), bag)
+    Exporter("ros2", bag).export(open_log(live))
     paths = (whole, live, parts[0], parts[-1], recovered)
     return {**dict(zip(KINDS, paths, strict=True)), "bag": bag}

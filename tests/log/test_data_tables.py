@@ -16,7 +16,7 @@ from tests.log.split_logs import change_message, make_bytes_of_messages, read_me
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
-from trilat_net.files import format_extra_install
+from trilat_net.files import Extra
 from trilat_net.log.data_tables import (
     UNIT_SUFFIXES,
     Column,
@@ -257,7 +257,7 @@ def test_missing_frame_libraries_name_their_installation(
     library: str, frame: Callable[[Log], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
-    hint = f"data frames need {library}: {format_extra_install('frames')}"
+    hint = f"data frames need {library}: {Extra('frames').install_command}"
     with pytest.raises(UsageError, match=re.escape(hint)):
         frame(make_log("paper"))
 

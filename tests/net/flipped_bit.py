@@ -12,8 +12,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.net import topics
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.member_keys import read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 

@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.net.bus import Bus
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus, read_zenoh_file
 
 from .certificates import Certificates

@@ -8,12 +8,13 @@ import msgspec
 import pytest
 
 from sites.change_server import ChangeServer
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.manual_clock import ManualClock
 from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
 from trilat_net.net import session_members, topics
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import Connection, DefaultEndpoints, find_free_endpoints
+from trilat_net.net.connection import Connection, DefaultEndpoints
 from trilat_net.net.discovery import connect_to_session
 from trilat_net.net.membership import EventPublisher, liveliness_token
 from trilat_net.net.messages import VERSION, Info

@@ -20,11 +20,12 @@ import pytest
 from cryptography import x509
 
 from tests.cli.running import trilat
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.app.cli.options import check_session_name
 from trilat_net.errors import LogRefused, ScenarioError, UsageError
 from trilat_net.net import member_keys, topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.connection import Connection, find_free_endpoints
+from trilat_net.net.connection import Connection
 from trilat_net.net.member_keys import (
     CERTIFICATE,
     MEMBERS,

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.waiting import until
 from trilat_net.errors import UsageError
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.ros2.ros2_graph import (
     TYPE_HASHES,
     Attachment,

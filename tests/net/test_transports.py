@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.net.free_endpoints import find_free_endpoints
 from trilat_net.errors import UsageError
-from trilat_net.net.connection import Connection, find_free_endpoints
+from trilat_net.net.connection import Connection
 from trilat_net.net.member_keys import create_keys, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 

@@ -15,7 +15,7 @@ from tests.log.builders import write_log
 from tests.log.standard_files import SCENARIO
 from tests.programs import RERUN, run_program
 from trilat_net.errors import LogError, RunFailed, UsageError
-from trilat_net.files import format_extra_install
+from trilat_net.files import Extra
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.ros2.cdr import JOINT_STATE
 from trilat_net.log.ros2.published import Ros2Topics
@@ -143,7 +143,7 @@ def test_failures_are_reported(
     with pytest.raises(LogError, match="No such file"):
         run_viewer([tmp_path / "none.mcap"], web)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(UsageError, match=re.escape(format_extra_install("view"))):
+    with pytest.raises(UsageError, match=re.escape(Extra("view").install_command)):
         run_viewer([files["live"]], web)
 
 

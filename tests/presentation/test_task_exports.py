@@ -25,7 +25,6 @@ from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.published import Ros2Topics
 from trilat_net.presentation.export import Exporter
-from trilat_net.presentation.exports.ros2 import export_ros2
 from trilat_net.presentation.rerun_viewer import ViewerOptions, open_rerun
 from trilat_net.scenario import parse_scenario
 
@@ -142,14 +141,17 @@ def test_messages_are_in_order_of_arrival(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "bag.mcap"
-    log_times = list[int]()
-    export_ros2(make_log("paper"), path, log_times.append)
+    progress = list[tuple[int, int]]()
+    Exporter("ros2", path).export(
+        make_log("paper"), progress=lambda *counts: progress.append(counts)
+    )
     with path.open("rb") as stream:
         messages = list(make_reader(stream).iter_messages(log_time_order=False))
     times = [message.log_time for _, _, message in messages]
     assert times == sorted(times)
     topics = [channel.topic for _, channel, _ in messages]
-    assert sum(topic.endswith("/joint_states") for topic in topics) == sum(log_times) == 3 * 120
+    assert sum(topic.endswith("/joint_states") for topic in topics) == 3 * 120
+    assert progress[-1] == (3 * 120, 3 * 120)
     assert {"/paper/m1/link_age", "/paper/events", "/paper/log", "/tf", "/diagnostics"} <= set(
         topics
     )
@@ -166,7 +168,7 @@ def test_late_records_stand_where_they_came(tmp_path: Path) -> None:
         )
     )
     path = tmp_path / "bag.mcap"
-    export_ros2(log, path)
+    Exporter("ros2", path).export(log)
     with path.open("rb") as stream:
         states = [m for _, c, m in make_reader(stream).iter_messages("/paper/m1/joint_states")]
     assert len(states) == 100
@@ -180,4 +182,4 @@ def test_unreadable_records_are_reported(tmp_path: Path) -> None:
         )
     )
     with pytest.raises(LogError, match="a record of m1 cannot be read"):
-        export_ros2(log, tmp_path / "bag.mcap")
+        Exporter("ros2", tmp_path / "bag.mcap").export(log)

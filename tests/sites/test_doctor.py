@@ -13,12 +13,13 @@ from types import SimpleNamespace
 import pytest
 
 from tests.cli.running import trilat
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.manual_clock import ManualClock
 from tests.other_systems import replace_os
 from trilat_net.app import doctor
 from trilat_net.app.doctor import MachineExamination
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import Connection, find_free_endpoints
+from trilat_net.net.connection import Connection
 from trilat_net.net.member_keys import create_keys, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 

@@ -13,7 +13,6 @@ from sites.hand_server import MESSAGES_KEPT, HandServer
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import sleep_for_ns
-from trilat_net.app.running_session import open_hand
 from trilat_net.core.life.live_hand import ANOTHER_HOLDS, HandInForce
 from trilat_net.errors import UsageError
 from trilat_net.execution.verification import verify_log
@@ -27,7 +26,7 @@ from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
 
 from .relay import RelayClock
-from .sessions import SESSION, Session
+from .sessions import Session, reach_session
 
 LIVE = {f"sites.{name}.hands": [{"kind": "live"}] for name in ("m1", "m2")}
 SCENARIO = load_scenario("paper", {"duration_s": 1.5, **LIVE})
@@ -48,7 +47,9 @@ def make_holding_program(
     """A program that holds an arm, sixty times a second; it lets go at the end of its context."""
 
     def act(bus: Bus, clock: RelayClock) -> None:
-        with open_hand(bus, clock, SESSION, site, SCENARIO, f"hand at {site}") as hand:
+        with reach_session(bus, clock).open_hand(
+            bus, site, SCENARIO, f"hand at {site}"
+        ) as hand:
             while hand.record is None:
                 sleep_for_ns(clock, 1_000_000)
             for n in range(last):
@@ -122,13 +123,14 @@ def test_felt_torque_equals_the_arms_torque(session: tuple[Log, Felt]) -> None:
 def test_hands_follow_their_mode() -> None:
     bus = LocalNetwork().join()
     clock = ManualClock()
-    with open_hand(bus, clock, "t", "m1", SCENARIO) as hand:
+    running = reach_session(bus, clock)
+    with running.open_hand(bus, "m1", SCENARIO) as hand:
         with pytest.raises(UsageError, match="can move, not push"):
             hand.push(1.0, 2.0)
         with pytest.raises(UsageError, match="finite"):
             hand.move(math.nan, 0.0)
     with pytest.raises(UsageError, match="such an operator are m1, m2"):
-        open_hand(bus, clock, "t", "s", SCENARIO)
+        running.open_hand(bus, "s", SCENARIO)
 
 
 class Served:

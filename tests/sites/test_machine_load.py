@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sites import machine_load
-from sites.machine_load import MEASURED_NS, check_machine_load
 from tests.net.manual_clock import ManualClock
+from trilat_net.app import machine_load
+from trilat_net.app.machine_load import MEASURED_NS, check_machine_load
 
 BEFORE = "cpu  100 0 50 800 50 0 0 0 0 0\ncpu0 1 1 1 1 1 1 1 1 1 1\n"
 

@@ -8,6 +8,7 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import trilat
 from tests.json_outline import is_documented
+from tests.net.free_endpoints import find_free_endpoints
 from tests.net.local_bus import LocalNetwork
 from trilat_net.app.network_benchmark import (
     SESSION,
@@ -19,7 +20,6 @@ from trilat_net.app.network_benchmark import (
     run_far_end,
 )
 from trilat_net.net import topics
-from trilat_net.net.connection import find_free_endpoints
 from trilat_net.results import Result
 
 from .relay import Relay

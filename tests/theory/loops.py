@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from trilat_net.analysis.theory.linear_loop import DelayedTerm, LinearLoop
 from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource
 from trilat_net.core.arms.two_link_arm import ArmLinks
-from trilat_net.core.step.site_setup import Gains, Law, Scheme, SiteSetup
+from trilat_net.core.step.site_setup import Gains, Law, SiteSetup
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def draw_site(
     return SiteSetup(
         name="x",
         rate_hz=1000,
-        scheme=Scheme.SECOND_ORDER,
+        digital=False,
         gains=GAINS[law](rng),
         theta=links.theta(),
         g_m_s2=9.81,

@@ -258,7 +258,7 @@ def test_two_closed_groups_have_several_betas() -> None:
     """Errata 11, N >= 4."""
     alpha = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]])
     assert np.linalg.matrix_rank(alpha - np.eye(4)) == 2
-    assert DominanceMatrix(alpha).find_closed_groups() == ((0, 1), (2, 3))
+    assert DominanceMatrix(alpha).closed_groups == ((0, 1), (2, 3))
 
 
 # --- 12: what is not an error but follows ---------------------------------------------------------------

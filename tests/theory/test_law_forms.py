@@ -28,8 +28,8 @@ from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.analysis.theory.port_response import evaluate_transfer
+from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.errors import ScenarioError
-from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
 
 ALONG = np.array([1.0, 0.5])
@@ -174,7 +174,7 @@ def test_six_channels_with_accelerations_share_as_published(
     a: float, user: int, values: tuple[float, float]
 ) -> None:
     names = ("u1", "u2", "s")
-    alpha = complementary_shares(a)
+    alpha = DominanceMatrix.complementary(a).alpha
     shares = {
         site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
         for i, site in enumerate(names)
@@ -214,7 +214,7 @@ def test_shared_authority_has_its_springs_roots() -> None:
     d = 5.0
     K_a = 10.0
     names = ("u1", "u2", "s")
-    alpha = complementary_shares(a)
+    alpha = DominanceMatrix.complementary(a).alpha
     shares = {
         site: {other: float(alpha[i, j]) for j, other in enumerate(names) if other != site}
         for i, site in enumerate(names)

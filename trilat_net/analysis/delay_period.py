@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core import DelayKind
 from ..scenario import LinkBase, Scenario
 
 MAX_PERIOD_TICKS = 400_000
@@ -32,27 +31,6 @@ _SLIP = 0.05
 
 If there is no such span, the span with the smallest change is used, up to half a tick.
 """
-_US_PER_S = 1_000_000
-
-
-def _find_cycle(link: LinkBase) -> Fraction | None:
-    """Returns the period of a link's delay, in s. `None` if its delay is constant or random.
-
-    The period is a fraction of whole numbers, which makes common multiples of periods exact.
-
-    Args:
-        link: Delay model of the link.
-    """
-    model = link.to_core_model()
-    table = link.points
-    if table is not None and model.kind == DelayKind.TRACE and len(table) > 1:
-        # the last point lasts as long as the point before it
-        last_us = int(table[-1, 0])
-        end_us = 2 * last_us - int(table[-2, 0])
-        return Fraction(end_us, _US_PER_S)
-    if model.kind == DelayKind.SINE:
-        return Fraction(round(model.extra), _US_PER_S)
-    return None
 
 
 def find_link_period_s(link: LinkBase) -> float | None:
@@ -67,10 +45,8 @@ def find_link_period_s(link: LinkBase) -> float | None:
         The period, or `None` if the delay is constant, random or measured, or follows a trace
         that ends.
     """
-    if link.to_core_model().has_ending_trace:
-        return None
-    cycle = _find_cycle(link)
-    return None if cycle is None else float(cycle)
+    repetition_s = link.repetition_s
+    return None if repetition_s is None else float(repetition_s)
 
 
 def _find_common_period(cycles: Iterable[Fraction], common_hz: int) -> Fraction:
@@ -165,9 +141,10 @@ class DelayPeriod(NamedTuple):
             ends.
         """
         for link in links:
-            if link.random or link.measured or link.to_core_model().has_ending_trace:
+            if link.random or link.measured or link.has_ending_trace:
                 return cls(None, None)
-        cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
+        all_cycles = [link.repetition_s for link in links]
+        cycles = [cycle for cycle in all_cycles if cycle is not None]
         true_period = _find_common_period(cycles, math.gcd(*rates_hz))
         true_s = float(true_period)
         if true_s * max(rates_hz) <= MAX_PERIOD_TICKS:

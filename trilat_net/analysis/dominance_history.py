@@ -392,6 +392,6 @@ def compute_lyapunov_weights(alpha: Array, Kd: Array) -> _LyapunovWeights:
     factor = sites / beta.sum()
     return _LyapunovWeights(
         beta=beta * factor,
-        groups=dominance.find_closed_groups(),
+        groups=dominance.closed_groups,
         scales=scales,
     )

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core import AHEAD_LIMIT_NS, LOST, Array, DelayKind, LinkSchedule
+from ..core import AHEAD_LIMIT_NS, LOST, Array, LinkSchedule
 from ..log import Ints, Log, SiteLog
 from ..records import NS_PER_S
 from .aligned import Bools
@@ -117,7 +117,6 @@ def predict_delivery(
         if command.peer == peer_index and command.model is not None
     ]
     schedule = LinkSchedule(link_setup, commanded_models)
-    models = schedule.models
     due_ns = schedule.draw(count)
 
     # The same link without duplicates, reordering and play-out buffer. It is computed only if
@@ -127,16 +126,15 @@ def predict_delivery(
     delay_alone.models["in_order"] = 0
     delay_alone.models["playout_us"] = 0
     drawn_ns = due_ns
-    if not np.array_equal(delay_alone.models, models):
+    if not np.array_equal(delay_alone.models, schedule.models):
         drawn_ns = delay_alone.draw(count)
 
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // link_setup.rate_hz
-    model_index = np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")
     return _PredictedDelivery(
         stamp_ns=stamp_ns,
         due_ns=due_ns,
         drawn_ns=drawn_ns,
-        measured=models["kind"][model_index] == DelayKind.MEASURED,
+        measured=schedule.find_measured(stamp_ns),
         copies=int(schedule.row.copies),
     )
 

@@ -909,7 +909,7 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
             total_shares[site, scenario.names.index(peer)] += share
     # a share in either direction couples two sites
     coupling = DominanceMatrix(total_shares + total_shares.T)
-    return [list(group) for group in coupling.find_closed_groups()]
+    return [list(group) for group in coupling.closed_groups]
 
 
 def _find_disagreement(

@@ -266,7 +266,7 @@ def _compute_rate_misfit(measured_per_s: float, root_per_s: float) -> float:
 
 
 class RunFindings(NamedTuple):
-    """All evidence on the stability of a run, the input of `decide_stability`.
+    """All evidence on the stability of a run, the input of `decide`.
 
     Attributes:
         end: How the motion ends.

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..core import HELD_OVERRUN_TICKS, DelayKind, LifeAlarm
+from ..core import HELD_OVERRUN_TICKS, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log
 from ..net import MODES, ModeMeaning
@@ -152,7 +152,7 @@ class StatedLink(NamedTuple):
         The stability theorem requires constant delays.
         """
         link = self.models[0].link
-        is_constant = link.to_core_model().kind == DelayKind.CONSTANT
+        is_constant = link.constant_delay_ms is not None
         is_lossless = not (link.loss or link.duplicate or link.outages_s)
         return is_constant and is_lossless and len(self.models) == 1
 

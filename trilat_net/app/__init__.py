@@ -13,7 +13,6 @@ __all__ = [
     "options",
     "run_and_report",
     "seconds",
-    "show_progress",
     "value",
     # The Python interface
     "AnyScenario",
@@ -25,8 +24,6 @@ __all__ = [
     "ShareHistory",
     "StatusRow",
     "compile_core",
-    "open_hand",
-    "ping_session",
     "run_demo",
     # Input devices
     "Device",
@@ -38,25 +35,23 @@ if TYPE_CHECKING:
     from .api import AnyScenario, Overrides
     from .cli import options
     from .cli.options import seconds, value
-    from .cli.run_progress import show_progress
     from .cli.sessions import run_and_report
     from .demo_session import SessionResult, compile_core, run_demo
     from .input_device import Device, DeviceState, Vector
     from .monitor import SessionDisplay, StatusRow
-    from .running_session import RunningSession, ShareHistory, open_hand
-    from .session_ping import ping_session
+    from .running_session import RunningSession
+    from .share_history import ShareHistory
 else:
     __getattr__ = import_on_use(
         __name__,
         {
             "api": "AnyScenario Overrides",
             "cli.options": "options seconds value",
-            "cli.run_progress": "show_progress",
             "cli.sessions": "run_and_report",
             "demo_session": "SessionResult compile_core run_demo",
             "input_device": "Device DeviceState Vector",
             "monitor": "SessionDisplay StatusRow",
-            "running_session": "RunningSession ShareHistory open_hand",
-            "session_ping": "ping_session",
+            "running_session": "RunningSession",
+            "share_history": "ShareHistory",
         },
     )

@@ -27,14 +27,15 @@ from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, 
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from multiprocessing.connection import Connection, Pipe
+from multiprocessing.connection import Connection as PipeEnd
+from multiprocessing.connection import Pipe
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from rich.console import Console
 from setproctitle import setproctitle
 
-from sites import check_machine_load, warm_up
+from sites import warm_up
 from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
@@ -46,9 +47,10 @@ from trilat_net.signals import Interrupt
 from ..core import compiling_notice, is_core_cached
 from ..files import refuse_link
 from ..log import Log, open_log
-from ..net import Clock, DefaultEndpoints, SystemClock, ZenohBus
+from ..net import Clock, Connection, DefaultEndpoints, SystemClock
 from ..records import NS_PER_S
 from ..scenario import HandSite, check_outside_arms
+from .machine_load import check_machine_load
 from .monitor import SessionDisplay, SessionMonitor
 
 POLL_NS = 100_000_000
@@ -361,7 +363,7 @@ def run_demo(
         if attend is not None:
             attending = attend(session, endpoints, display.say)
         try:
-            with closing(ZenohBus([], endpoints)) as bus, attending as should_end:
+            with closing(Connection(connect=endpoints).open()) as bus, attending as should_end:
                 monitor = SessionMonitor(bus, session, scenario, display)
                 while not interrupt.is_requested() and not should_end():
                     if _is_over([*sites, *recorder], result):
@@ -635,7 +637,7 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
     # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
     # is delivered as soon as the copy has one.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    return _StarterProcess(Connection(number)).serve()
+    return _StarterProcess(PipeEnd(number)).serve()
 
 
 class _StarterProcess:
@@ -647,7 +649,7 @@ class _StarterProcess:
         pipe: Connection to the requesting process.
     """
 
-    def __init__(self, pipe: Connection) -> None:
+    def __init__(self, pipe: PipeEnd) -> None:
         self._pipe = pipe
         self._running: dict[str, int] = {}
 

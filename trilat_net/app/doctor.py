@@ -19,14 +19,14 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from sites import check_machine_load, rehearse_loop, warm_up
+from sites import rehearse_loop, warm_up
 from trilat_net import workers
 from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
 from trilat_net.files import read_foreign_permissions
@@ -37,18 +37,14 @@ from ..core import is_core_cached
 from ..net import (
     AUTHORITY,
     CERTIFICATE,
-    ENCRYPTED,
     ENDS_SOON,
     PRIVATE_KEY,
     Clock,
     Connection,
-    MemberKeys,
-    RouterSilent,
     SystemClock,
-    ZenohBus,
-    is_loopback,
     read_member_keys,
 )
+from .machine_load import check_machine_load
 from .session_ping import ping_session
 
 FindingState = Literal["ok", "warn", "fail"]
@@ -98,14 +94,18 @@ def _describe_untried(endpoint: str) -> DoctorFinding:
     return DoctorFinding("links", "warn", text)
 
 
-def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
+def _examine_listening(
+    endpoint: str, address: tuple[str, int], *, is_protected: bool
+) -> DoctorFinding:
     """Checks whether this machine can listen at a network endpoint, by listening for a moment.
 
-    The port may be in use already. An endpoint without encryption causes a warning.
+    The port may be in use already. An unprotected endpoint causes a warning.
 
     Args:
         endpoint: The endpoint, such as "tls/0.0.0.0:7447".
         address: Its host and port.
+        is_protected: True if the endpoint is encrypted or can only be reached from this
+            machine.
     """
     is_quic = endpoint.startswith("quic/")
     host, _ = address
@@ -123,7 +123,7 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
         text = f"cannot listen at {endpoint}: {error.strerror or error}"
         return DoctorFinding("links", "fail", text)
 
-    if endpoint.startswith(ENCRYPTED) or is_loopback(endpoint):
+    if is_protected:
         return DoctorFinding("links", "ok", f"can listen at {endpoint}")
 
     text = f"{endpoint} would listen unencrypted, to anybody who reaches it"
@@ -131,7 +131,7 @@ def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding
 
 
 def _examine_reaching(
-    endpoint: str, address: tuple[str, int], folder: Path | None
+    endpoint: str, address: tuple[str, int], folder: Path | None, *, is_protected: bool
 ) -> DoctorFinding:
     """Checks whether another process of a session answers at a TCP or TLS endpoint.
 
@@ -143,12 +143,14 @@ def _examine_reaching(
         address: Its host and port.
         folder: Folder of this member's keys. `None` if they cannot be used. Only the connection
             is then tried, and not the certificate.
+        is_protected: True if the endpoint is encrypted or can only be reached from this
+            machine.
     """
     try:
         with socket.create_connection(address, CONNECT_S) as tcp_link:
             is_encrypted = endpoint.startswith("tls/")
             if not is_encrypted:
-                state: FindingState = "ok" if is_loopback(endpoint) else "warn"
+                state: FindingState = "ok" if is_protected else "warn"
                 return DoctorFinding("links", state, f"{endpoint} answers, unencrypted")
 
             context = _tls_context(folder)
@@ -167,7 +169,7 @@ def _examine_reaching(
         return DoctorFinding("links", "fail", text)
 
 
-def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
+def _examine_quic(endpoint: str, settings: Mapping[str, Any] | None) -> DoctorFinding:
     """Checks whether another member of the session answers over QUIC, by connecting to it.
 
     Python has no QUIC client in its standard library. Therefore the connection uses Zenoh, the
@@ -175,10 +177,10 @@ def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFindin
 
     Args:
         endpoint: The endpoint.
-        member_keys: Keys of this member. `None` if there are no keys, or if they cannot be
-            used.
+        settings: Zenoh settings that use the keys of this member. `None` if there are no keys,
+            or if they cannot be used.
     """
-    if member_keys is None:
+    if settings is None:
         return DoctorFinding(
             "links",
             "warn",
@@ -186,10 +188,10 @@ def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFindin
         )
 
     try:
-        with closing(ZenohBus([], [endpoint], "client", member_keys.settings)):
+        with closing(Connection((), [endpoint], "client", settings).open()):
             text = f"{endpoint} answers over QUIC, with a certificate of the same authority"
             return DoctorFinding("links", "ok", text)
-    except (RouterSilent, UsageError) as error:
+    except (SessionError, UsageError) as error:
         return DoctorFinding(
             "links", "fail", f"{endpoint} does not answer a member with these keys: {error}"
         )
@@ -347,13 +349,12 @@ class MachineExamination:
         self._session = session
         self._clock = clock
         self._insecure = insecure
-        self._member_keys: MemberKeys | None = None
         self._keys_error = ""
-        if keys is not None:
-            try:
-                self._member_keys = read_member_keys(keys)
-            except UsageError as error:
-                self._keys_error = str(error)
+        try:
+            self._member_keys = None if keys is None else read_member_keys(keys)
+        except UsageError as error:
+            self._member_keys = None
+            self._keys_error = str(error)
 
     def run(self) -> Iterator[DoctorFinding]:
         """Performs all checks, and yields each finding as soon as it is known.
@@ -438,22 +439,27 @@ class MachineExamination:
             yield DoctorFinding("links", "fail", str(error))
             return
 
+        unprotected = secured.unprotected_addresses
         for endpoint in secured.listen_addresses:
             address = _split_address(endpoint)
             if address is None:
                 yield _describe_untried(endpoint)
             else:
-                yield _examine_listening(endpoint, address)
+                is_protected = endpoint not in unprotected
+                yield _examine_listening(endpoint, address, is_protected=is_protected)
 
         for endpoint in secured.connect_addresses:
             address = _split_address(endpoint)
             if endpoint.startswith("quic/"):
-                yield _examine_quic(endpoint, self._member_keys)
+                keys = self._member_keys
+                yield _examine_quic(endpoint, None if keys is None else keys.settings)
             elif address is None:
                 yield _describe_untried(endpoint)
             else:
                 folder = self._keys_folder if self._member_keys else None
-                yield _examine_reaching(endpoint, address, folder)
+                yield _examine_reaching(
+                    endpoint, address, folder, is_protected=endpoint not in unprotected
+                )
 
         if not secured.listen and not secured.connect:
             yield DoctorFinding(

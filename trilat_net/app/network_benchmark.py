@@ -28,8 +28,8 @@ import msgspec
 import numpy as np
 
 from trilat_net.errors import RunFailed, ScenarioError, UsageError
-from trilat_net.files import require_libraries
 from trilat_net.net import topics
+from trilat_net.package_names import require_libraries
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -42,14 +42,11 @@ from ..net import (
     Bus,
     Clock,
     Connection,
-    MemberKeys,
+    DefaultEndpoints,
     PeerSample,
     StampedInbox,
     SystemClock,
-    ZenohBus,
     create_keys,
-    find_free_endpoints,
-    read_member_keys,
 )
 
 SESSION = "benchmark"
@@ -216,18 +213,18 @@ class NearEnd:
 
 def _open(
     endpoint: str,
-    keys: MemberKeys | None,
+    keys: str | Path | None,
     *,
     listens: bool,
     insecure: bool,
-) -> tuple[ZenohBus, str]:
+) -> tuple[Bus, str]:
     """Opens the network connection of one end of a benchmark.
 
     The near end sends test messages, and the far end sends them back.
 
     Args:
         endpoint: Endpoint to listen at or to connect to.
-        keys: Keys of a site. They are used only if the endpoint is encrypted.
+        keys: Folder with the keys of a site. They are used only if the endpoint is encrypted.
         listens: True for the far end.
         insecure: True to permit connections without keys, because everybody on the network is
             trusted.
@@ -245,13 +242,6 @@ def _open(
             f"{endpoint}: an encrypted endpoint needs keys: give --keys DIR with the keys of a "
             "site"
         )
-    if is_encrypted and keys is not None and keys.member in (*ROLES, ROUTER):
-        raise UsageError(
-            "--keys: a benchmark sends messages as sites send samples, and so needs the keys "
-            f"of a site, not those of {keys.member}"
-        )
-
-    used_keys = keys if is_encrypted else None
     if listens:
         connection = Connection(listen=[endpoint])
         name = FAR
@@ -259,8 +249,13 @@ def _open(
         connection = Connection(connect=[endpoint])
         name = NEAR
 
-    bus = connection.secure(used_keys, insecure=insecure).open()
-    return bus, used_keys.member if used_keys else name
+    secured = connection.secure(keys if is_encrypted else None, insecure=insecure)
+    if secured.keys_of in (*ROLES, ROUTER):
+        raise UsageError(
+            "--keys: a benchmark sends messages as sites send samples, and so needs the keys "
+            f"of a site, not those of {secured.keys_of}"
+        )
+    return secured.open(), secured.keys_of or name
 
 
 def run_far_end(
@@ -288,12 +283,11 @@ def run_far_end(
     Raises:
         UsageError: An endpoint or the keys cannot be used.
     """
-    member_keys = None if keys is None else read_member_keys(keys)
     clock = SystemClock()
     started_ns = clock.monotonic_ns()
     with ExitStack() as stack:
         for endpoint in endpoints:
-            bus, member = _open(endpoint, member_keys, listens=True, insecure=insecure)
+            bus, member = _open(endpoint, keys, listens=True, insecure=insecure)
             answer_benchmarks(stack.enter_context(closing(bus)), member)
         say(f"answers benchmarks at {', '.join(endpoints)}; Ctrl-C ends it")
         while not stopped() and clock.monotonic_ns() - started_ns < duration_s * 1e9:
@@ -313,9 +307,9 @@ def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
     Yields:
         The endpoints of the far end, and the folder with the keys of the near end.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    reserved = DefaultEndpoints(SESSION).reserve(len(PROTOCOLS))
+    with tempfile.TemporaryDirectory() as folder, reserved as free_endpoints:
         near_keys, far_keys = create_keys(Path(folder) / "keys", [NEAR, FAR], days=1)
-        free_endpoints = find_free_endpoints(len(PROTOCOLS))
         endpoints = []
         for protocol, endpoint in zip(PROTOCOLS, free_endpoints, strict=True):
             endpoints.append(endpoint.replace("tcp", protocol))
@@ -596,11 +590,10 @@ def ping_benchmark(
     with ExitStack() as stack:
         if not connect:
             connect, keys = stack.enter_context(_run_local_far_end(duration_s))
-        member_keys = None if keys is None else read_member_keys(keys)
         case_s = duration_s / (len(connect) * len(SIZE_FACTORS) * len(RATE_SHARES))
         rows: list[dict[str, Any]] = []
         for endpoint in connect:
-            rows += _measure_endpoint(endpoint, member_keys, needs, case_s)
+            rows += _measure_endpoint(endpoint, keys, needs, case_s)
 
     # Only the case with the scenario's own message size and rate is judged.
     scenario_case = (needs.sample_bytes, needs.rate_hz)
@@ -616,7 +609,7 @@ def ping_benchmark(
 
 def _measure_endpoint(
     endpoint: str,
-    keys: MemberKeys | None,
+    keys: str | Path | None,
     needs: NetworkNeeds,
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
@@ -626,7 +619,7 @@ def _measure_endpoint(
 
     Args:
         endpoint: Endpoint of the far end.
-        keys: Keys of this end. `None` if the endpoint is not encrypted.
+        keys: Folder with the keys of this end. `None` if the endpoint is not encrypted.
         needs: Requirements of the scenario, which determine the sizes and rates.
         case_s: Duration of each measurement, in s.
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import RunFailed
-from ..net import Clock, RouterSilent, SystemClock
+from ..errors import RunFailed, SessionError
+from ..net import Clock, SystemClock
 from ..net.ros2 import ROUTER_ADVICE, Attachment, Refusals, Ros2Graph, check_ros_name
 from ..records import NS_PER_S
 from ..results import Result
@@ -49,7 +49,7 @@ def ping_topic(
 
     Raises:
         UsageError: The name of the topic is invalid.
-        RouterSilent: No router answers.
+        SessionError: No router answers.
         RunFailed: No program has published on the topic.
     """
     name = check_ros_name(topic, "topic")
@@ -63,8 +63,8 @@ def ping_topic(
             clock=clock,
             domain=domain,
         )
-    except RouterSilent as silent:
-        raise RouterSilent(f"{silent}; {ROUTER_ADVICE}") from None
+    except SessionError as silent:
+        raise SessionError(f"{silent}; {ROUTER_ADVICE}") from None
 
     with graph, Interrupt() as interrupt:
         return TopicDelays.measure(graph, clock, name, lasts_s, interrupt.is_requested)

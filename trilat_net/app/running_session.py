@@ -17,14 +17,13 @@ Invariant:
 
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 from trilat_net.entry_points import HOOKS, load_entry
-from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
+from trilat_net.errors import RunFailed, SessionError, UsageError
 from trilat_net.net import topics
 from trilat_net.scenario import Scenario, parse_embedded
 
@@ -46,22 +45,14 @@ from ..net import (
     connect_to_session,
     read_messages,
 )
-from ..scenario import PictureDelay, parse_core_change
 from .input_device import Device
 from .session_ping import PingReport, ping_session
+from .session_search import SessionSearch
+from .share_history import ShareHistory
+from .visible_states import STATES_KEPT, VisibleStates
 
-GATHERING_NS = 500_000_000
-"""Time that further sites have to reply after the first reply, in ns.
-
-It applies to sessions that sites may leave, in which some sites may never reply.
-"""
 RETRY_NS = 50_000_000
 """Time between two attempts to reach a site, in ns."""
-STATES_KEPT = 4096
-"""Number of records that `RunningSession.records` and `states` keep.
-
-The record of a peer's sample in use is found among them by its tick.
-"""
 AHEAD_S = 0.5
 """Time from the newest known tick of any site to the tick at which a session is ended, in s.
 
@@ -76,65 +67,6 @@ SOURCE = "the operator"
 def _never_stopped() -> bool:
     """Returns False. It is the function `stopped` for calls that only a time limit ends."""
     return False
-
-
-class ShareHistory:
-    """Tracks how the dominance factors of an arm change over the time of a session.
-
-    A dominance factor is the weight with which the arm follows another arm. The scenario sets
-    the initial factors and planned changes, and users may request more changes during the
-    session. Each change is a linear ramp from the current factors to new ones.
-    """
-
-    def __init__(self, scenario: Scenario, site: str) -> None:
-        self._scenario = scenario
-        self._site = site
-        self._later_ramps = scenario.scripted_ramps(site)
-        self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
-        self._shares_before = self._ramp.alpha
-
-    def add_change(self, change: str) -> None:
-        """Adds a change of dominance factors that a site has reported as an event.
-
-        Changes of other settings, and strings that do not describe a change, are ignored.
-
-        Args:
-            change: Description of the change, from the field `command` of the event.
-        """
-        with suppress(ScenarioError):  # raised if the text is not a change
-            ramp = parse_core_change(self._scenario, self._site, change).ramp
-            # A ramp that starts before the present ramp was added earlier, from another event.
-            if ramp is not None and ramp.start_ns >= self._ramp.start_ns:
-                self._later_ramps.append(ramp)
-
-    def advance_to(self, t_ns: int) -> tuple[float, ...]:
-        """Computes the dominance factors (0 to 1) of an arm at a given time of the session.
-
-        Args:
-            t_ns: Time in ns after the start of the session. It must not be earlier than in the
-                previous call.
-
-        Returns:
-            One factor per peer, in the order of the site's peers.
-        """
-        started_ramps = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
-        # A ramp starts from the factors that the previous ramp had reached by then.
-        for ramp in started_ramps:
-            self._shares_before = self._interpolate(ramp.start_ns)
-            self._ramp = ramp
-
-        # The other ramps have not begun yet.
-        self._later_ramps = [ramp for ramp in self._later_ramps if ramp.start_ns > t_ns]
-        return self._interpolate(t_ns)
-
-    def _interpolate(self, t_ns: int) -> tuple[float, ...]:
-        """Returns the dominance factors at a time during or after the present ramp."""
-        ramp = self._ramp
-        if t_ns >= ramp.end_ns:
-            return ramp.alpha
-        progress = (t_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
-        pairs = zip(self._shares_before, ramp.alpha, strict=True)
-        return tuple(before + progress * (after - before) for before, after in pairs)
 
 
 class RunningSession:
@@ -246,7 +178,7 @@ class RunningSession:
                 is_last_try = self._clock.monotonic_ns() >= give_up_ns
                 ignore_error = nullcontext() if is_last_try else suppress(SessionError)
                 with ignore_error:
-                    info = self._find_running(bus, site)
+                    info = SessionSearch(bus, self._clock, self.name).find_running(site)
                     break
                 self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)
 
@@ -282,14 +214,8 @@ class RunningSession:
         make_device_hand = load_entry(HOOKS, "device-hand", "RunningSession.lead")
         with (
             self.reach_site(site, timeout_s) as (bus, scenario),
-            open_hand(
-                bus=bus,
-                clock=self._clock,
-                session=self.name,
-                site=site,
-                scenario=scenario,
-                source=type(device).__name__,
-                repeats=False,
+            self.open_hand(
+                bus, site, scenario, source=type(device).__name__, repeats=False
             ) as hand,
         ):
             live = scenario.sites[site].find_live_hand(is_open=True)
@@ -308,6 +234,52 @@ class RunningSession:
             )
             device_hand.run(stopped, lambda text: say(f"{site}: {text}"))
             say(f"{site}: {device_hand.describe()}")
+
+    def open_hand(
+        self,
+        bus: Bus,
+        site: str,
+        scenario: Scenario,
+        source: str = "",
+        *,
+        repeats: bool = True,
+    ) -> Hand:
+        """Opens a connection through which a program moves an arm of a running session.
+
+        The program takes the place of the person who would otherwise hold the arm.
+
+        Args:
+            bus: Network connection that reaches the site.
+            site: Site of the arm.
+            scenario: Scenario of the session.
+            source: Name of the program or person, used in events of the session.
+            repeats: True to repeat the last message regularly from a thread, which shows the
+                site that the program is still running; see `Hand`.
+
+        Raises:
+            UsageError: The scenario does not allow a live operator at that arm.
+        """
+        scenario.find_site(site)
+        live = scenario.sites[site].find_live_hand(is_open=True)
+        if live is None:
+            open_sites = ", ".join(scenario.open_hands)
+            remedy = f"; the sites with such an operator are {open_sites}" if open_sites else ""
+            raise UsageError(
+                f"nobody can move the arm of {site}: "
+                f"the scenario has no operator of kind 'live' at this site{remedy}"
+            )
+
+        compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector
+        return Hand(
+            bus=bus,
+            clock=self._clock,
+            session=self.name,
+            site=site,
+            operator=live.actor,
+            compute_pose=compute_pose,
+            source=source,
+            repeats=repeats,
+        )
 
     def stop(self, *sites: str) -> list[str]:
         """Stops the given arms at once, while the rest of the session continues.
@@ -371,7 +343,7 @@ class RunningSession:
         # In a session with keys, every member may stop arms, but only the operator may do more.
         member = "" if order == "stop" else OPERATOR
         with self.reach(member) as bus:
-            scenario, infos = self._find_sites(bus)
+            scenario, infos = SessionSearch(bus, self._clock, self.name).find_all()
             for name in sites:
                 if name not in scenario.names:
                     known = f"its sites are {', '.join(scenario.names)}"
@@ -415,7 +387,7 @@ class RunningSession:
             SessionError: The session has not begun, or a site does not reply.
         """
         with self.reach() as bus:
-            scenario, infos = self._find_sites(bus)
+            scenario, infos = SessionSearch(bus, self._clock, self.name).find_all()
             present = _list_present(scenario, infos)
 
             missing = [name for name in present if name not in infos]
@@ -438,93 +410,9 @@ class RunningSession:
             request = ChangeRequest(stop_s=end_s)
             return [self._send_change(bus, name, request).text for name in present]
 
-    def _find_sites(self, bus: Bus) -> tuple[Scenario, dict[str, Info]]:
-        """Asks all sites of the session for their identities, and collects the replies.
-
-        A site is the process that controls one robot arm. The search ends when all sites of the
-        scenario have replied. If the scenario allows sites to leave, some may be absent. Then
-        the search also ends `GATHERING_NS` after the first reply.
-
-        Returns:
-            The scenario of the session, and the replies by the name of the site.
-
-        Raises:
-            SessionError: No site replies.
-        """
-        clock = self._clock
-        infos: dict[str, Info] = {}
-        scenario: Scenario | None = None
-        first_reply_ns: int | None = None  # time of the first reply of a site
-
-        for info in self._find_members(bus):
-            if scenario is None and info.scenario:
-                scenario = parse_embedded(info.scenario, self.name)
-            if scenario is None or info.member not in scenario.sites:
-                continue
-
-            infos[info.member] = info
-            if first_reply_ns is None:
-                first_reply_ns = clock.monotonic_ns()
-
-            waited_ns = clock.monotonic_ns() - first_reply_ns
-            is_complete = len(infos) == len(scenario.names)
-            has_waited_enough = scenario.sites_may_return and waited_ns > GATHERING_NS
-            if is_complete or has_waited_enough:
-                return scenario, infos
-
-        if scenario is None:
-            raise SessionError(
-                f"no site of session {self.name!r} answers; "
-                "to try other endpoints, name them with --connect"
-            )
-        return scenario, infos
-
-    def _find_members(self, bus: Bus) -> Iterator[Info]:
-        """Asks all processes of the session for their identities, and yields their replies.
-
-        A process may reply several times. The replies end after `REPLY_TIMEOUT_S`.
-        """
-        members = SessionMembers(bus, self._clock, self.name)
-        return members.find(stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S)
-
     def _read_site_names(self, text: str) -> tuple[str, ...]:
         """Returns the names of the sites from the text of the scenario in a site's reply."""
         return parse_embedded(text, self.name).names
-
-    def _find_running(self, bus: Bus, site: str) -> Info:
-        """Waits for the reply of one site, and checks that the site runs.
-
-        All members of the session are asked. The reply of any site contains the scenario, which
-        shows whether the name of the wanted site is misspelled.
-
-        Args:
-            bus: Network connection that reaches the session.
-            site: Name of the site, the process that controls one arm.
-
-        Returns:
-            The identity of the site.
-
-        Raises:
-            SessionError: The session has no such site or has not begun, or the site does not
-                reply in time.
-        """
-        for info in self._find_members(bus):
-            if info.member == site:
-                if not info.running:
-                    raise SessionError(
-                        f"session {self.name!r} has not begun: {site} waits for the others"
-                    )
-                return info
-
-            names = self._read_site_names(info.scenario) if info.scenario else ()
-            if names and site not in names:
-                known = f"its sites are {', '.join(names)}"
-                raise SessionError(f"session {self.name!r} has no site {site!r}; {known}")
-
-        raise SessionError(
-            f"site {site!r} of session {self.name!r} does not answer; "
-            "to try other endpoints, name them with --connect"
-        )
 
     def set_link(self, link: str, **to: Any) -> str:
         """Changes settings of a link while the session runs, as `trilat set link` does.
@@ -600,7 +488,7 @@ class RunningSession:
                 reply.
         """
         with self.reach() as bus:
-            self._find_running(bus, site)
+            SessionSearch(bus, self._clock, self.name).find_running(site)
             return self._send_change(bus, site, request)
 
     @contextmanager
@@ -656,49 +544,7 @@ class RunningSession:
             A function that returns one record per site, keyed by site name.
         """
         with self.reach("") as bus:
-            inbox = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
-            latest_records: dict[str, deque[State]] = {}
-            picture_delay: PictureDelay | None = None  # created when the first record arrives
-
-            def find() -> dict[str, State]:
-                """Returns the latest known record of each site, keyed by site name.
-
-                The dictionary is empty until the first record has arrived.
-
-                With `as_site`, the records show what the user of that site sees. They may be
-                older, because the scenario may delay the user's picture. `picture_delay`
-                computes which tick of each arm the user sees, and `latest_records` keeps the
-                records that arrive from `inbox`.
-                """
-                nonlocal picture_delay
-                for record in read_messages(inbox, State):
-                    if record.site not in latest_records:
-                        latest_records[record.site] = deque(maxlen=STATES_KEPT)
-                    latest_records[record.site].append(record)
-                newest_records = {site: records[-1] for site, records in latest_records.items()}
-                if not as_site:
-                    return newest_records
-                if as_site not in newest_records:
-                    return {}
-
-                if picture_delay is None:
-                    # The site runs, because a record of it has arrived, and sends its scenario.
-                    info = self._find_running(bus, as_site)
-                    scenario = parse_embedded(info.scenario, self.name)
-                    picture_delay = PictureDelay(scenario, as_site)
-
-                user_record = newest_records[as_site]
-                visible_records = {as_site: user_record}
-                # The field `used` states which sample of each peer the control law used.
-                visible_ticks = picture_delay.advance_to(user_record.tick, user_record.used)
-                for peer, visible_tick in visible_ticks.items():
-                    for record in reversed(latest_records.get(peer, deque())):
-                        if record.tick == visible_tick:
-                            visible_records[peer] = record
-                            break
-                return visible_records
-
-            yield find
+            yield VisibleStates(bus, self._clock, self.name, as_site).read
 
     def mark(self, text: str) -> str:
         """Adds a text mark to the log at the current time.
@@ -714,7 +560,7 @@ class RunningSession:
             The reply of the site, as a sentence.
         """
         with self.reach() as bus:
-            scenario, infos = self._find_sites(bus)
+            scenario, infos = SessionSearch(bus, self._clock, self.name).find_all()
             first_present = next(name for name in scenario.names if name in infos)
             reply = self._send_change(bus, first_present, ChangeRequest(mark=text))
             return reply.text
@@ -761,7 +607,7 @@ class RunningSession:
             A function that returns the current weights, keyed by peer name.
         """
         with self.reach("") as bus:
-            info = self._find_running(bus, site)
+            info = SessionSearch(bus, self._clock, self.name).find_running(site)
             records = bus.inbox(topics.key(self.name, site, topics.STATE), 256)
             events = bus.inbox(topics.key(self.name, site, topics.EVENT), 256)
             scenario = parse_embedded(info.scenario, self.name)
@@ -904,68 +750,12 @@ def hand(
             cannot be used.
     """
     connection = Connection.of_member(None, connect, router).secure(keys, insecure=False)
+    running = RunningSession(session, connection)
     with (
-        RunningSession(session, connection).reach_site(site, timeout_s) as (bus, scenario),
-        open_hand(
-            bus=bus,
-            clock=SystemClock(),
-            session=session,
-            site=site,
-            scenario=scenario,
-            source=source,
-        ) as port,
+        running.reach_site(site, timeout_s) as (bus, scenario),
+        running.open_hand(bus, site, scenario, source) as port,
     ):
         yield port
-
-
-def open_hand(
-    bus: Bus,
-    clock: Clock,
-    session: str,
-    site: str,
-    scenario: Scenario,
-    source: str = "",
-    *,
-    repeats: bool = True,
-) -> Hand:
-    """Opens a connection through which a program moves an arm of a running session.
-
-    The program takes the place of the person who would otherwise hold the arm.
-
-    Args:
-        bus: Network connection that reaches the site.
-        clock: Clock of this process.
-        session: Name of the session.
-        site: Site of the arm.
-        scenario: Scenario of the session.
-        source: Name of the program or person, used in events of the session.
-        repeats: True to repeat the last message regularly from a thread, which shows the site
-            that the program is still running; see `Hand`.
-
-    Raises:
-        UsageError: The scenario does not allow a live operator at that arm.
-    """
-    scenario.find_site(site)
-    live = scenario.sites[site].find_live_hand(is_open=True)
-    if live is None:
-        open_sites = ", ".join(scenario.open_hands)
-        remedy = f"; the sites with such an operator are {open_sites}" if open_sites else ""
-        raise UsageError(
-            f"nobody can move the arm of {site}: "
-            f"the scenario has no operator of kind 'live' at this site{remedy}"
-        )
-
-    compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector
-    return Hand(
-        bus=bus,
-        clock=clock,
-        session=session,
-        site=site,
-        operator=live.actor,
-        compute_pose=compute_pose,
-        source=source,
-        repeats=repeats,
-    )
 
 
 def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:

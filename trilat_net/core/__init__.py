@@ -44,11 +44,9 @@ __all__ = [
     "MotionLimits",
     "RecordedRows",
     "RestGains",
-    "Scheme",
     "Site",
     "SiteArrays",
     "SiteSetup",
-    "StaleAction",
     "StaleRule",
     "TaskSetup",
     "TickRepeater",
@@ -58,7 +56,6 @@ __all__ = [
     "Pair",
     "Points",
     "Vector",
-    "rotation_matrix",
     "sincos",
     "tanh",
     # Compiled functions
@@ -90,11 +87,9 @@ __all__ = [
     "TorqueSource",
     # Links and dominance
     "AHEAD_LIMIT_NS",
-    "LINK_MODEL_DTYPE",
     "LOST",
     "MAX_DELAY_US",
     "ROW_SUM_TOLERANCE",
-    "DelayKind",
     "DominanceMatrix",
     "LinkModel",
     "LinkSchedule",
@@ -117,18 +112,15 @@ __all__ = [
     "HELD_OVERRUN_TICKS",
     "REST_RATE_1_S",
     # Control laws of users
-    "MAX_RECORD_SENT",
     "MAX_SENT",
     "LawChannel",
     "LawContext",
     "LawEnergies",
     "LawInput",
     "LawRecords",
-    "PeerRecords",
     "PeerView",
     "SentVector",
     "UserLaw",
-    "UserModel",
     "UserLawFactory",
     "compiled",
     "plug_law",
@@ -147,7 +139,6 @@ if TYPE_CHECKING:
     from .arms.elementary import sincos, tanh
     from .arms.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
     from .arms.frame_pose import FramePose
-    from .arms.rotation import rotation_matrix
     from .arms.task_space import POSE, POSITION
     from .arms.two_link_arm import ArmLinks, forward_kinematics, regressor
     from .lanes.lane_episodes import LaneEpisodes
@@ -167,15 +158,14 @@ if TYPE_CHECKING:
     from .life.safeguards import BLEND_S
     from .life.session_life import HELD_OVERRUN_TICKS
     from .links.channel import LOST
-    from .links.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, DelayKind, LinkModel, draw_pair
+    from .links.delay import MAX_DELAY_US, LinkModel, draw_pair
     from .links.dominance import ROW_SUM_TOLERANCE, DominanceMatrix
     from .links.link import AHEAD_LIMIT_NS
     from .links.link_schedule import LinkSchedule
     from .links.philox import link_key
     from .plug.compiled_law import compiled, plug_law
-    from .plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
-    from .plug.law_energy import LawEnergies, LawRecords, PeerRecords
-    from .plug.plugged import UserModel
+    from .plug.law_channel import MAX_SENT, LawChannel, SentVector
+    from .plug.law_energy import LawEnergies, LawRecords
     from .plug.user_law import LawContext, LawInput, PeerView, UserLaw, UserLawFactory
     from .step.compiled_run import CompiledRun
     from .step.control import ROBUST_RESIDUE
@@ -191,9 +181,7 @@ if TYPE_CHECKING:
         LinkSetup,
         MotionLimits,
         RestGains,
-        Scheme,
         SiteSetup,
-        StaleAction,
         StaleRule,
         TaskSetup,
     )
@@ -223,7 +211,6 @@ else:
             "arms.elementary": "sincos tanh",
             "arms.exogenous": "LIVE_KINDS OWN_KINDS SCRIPTED_KINDS TorqueKind TorqueSource",
             "arms.frame_pose": "FramePose",
-            "arms.rotation": "rotation_matrix",
             "arms.task_space": "POSE POSITION",
             "arms.two_link_arm": "ArmLinks forward_kinematics regressor",
             "arms.two_link_stages": "two_link_stages",
@@ -238,15 +225,14 @@ else:
             "life.safeguards": "BLEND_S",
             "life.session_life": "HELD_OVERRUN_TICKS",
             "links.channel": "LOST",
-            "links.delay": "DelayKind LINK_MODEL_DTYPE LinkModel MAX_DELAY_US draw_pair",
+            "links.delay": "LinkModel MAX_DELAY_US draw_pair",
             "links.dominance": "DominanceMatrix ROW_SUM_TOLERANCE",
             "links.link": "AHEAD_LIMIT_NS",
             "links.link_schedule": "LinkSchedule",
             "links.philox": "link_key",
             "plug.compiled_law": "compiled plug_law",
-            "plug.law_channel": "LawChannel MAX_RECORD_SENT MAX_SENT SentVector",
-            "plug.law_energy": "LawEnergies LawRecords PeerRecords",
-            "plug.plugged": "UserModel",
+            "plug.law_channel": "LawChannel MAX_SENT SentVector",
+            "plug.law_energy": "LawEnergies LawRecords",
             "plug.user_law": "LawContext LawInput PeerView UserLaw UserLawFactory",
             "step.compiled_run": "CompiledRun",
             "step.control": "ROBUST_RESIDUE",
@@ -256,8 +242,8 @@ else:
             "step.run_inputs": "RunInputs",
             "step.site_arrays": "MAX_CHANGES MAX_LINKS_BYTES MAX_RAMPS SiteArrays",
             "step.site_setup": (
-                "ChainSetup Gains Law LinkSetup MotionLimits RestGains Scheme SiteSetup "
-                "StaleAction StaleRule TaskSetup"
+                "ChainSetup Gains Law LinkSetup MotionLimits RestGains SiteSetup StaleRule "
+                "TaskSetup"
             ),
             "step.site_step": "Site",
             "step.ticks": (

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import BUCKETS_PER_S, Array, Law, RunInputs
+from ..core import BUCKETS_PER_S, Array, RunInputs
 from ..errors import NotRepeatable, UsageError, count_nouns
 from ..log import Ints, Log
 from ..records import NS_PER_S
@@ -154,7 +154,7 @@ class Push(NamedTuple):
         """
         # The target of "m1 joint 1" is "m1.q1".
         joint_targets = [joint.replace(" joint ", ".q") for joint in _list_joints(scenario)]
-        has_estimates = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
+        has_estimates = any(scenario.gains(name).is_adaptive for name in scenario.names)
         # One push for each joint, and two for the estimates and for a random direction.
         complete_count = len(joint_targets) + 2
         if count is None:
@@ -334,7 +334,7 @@ def _count_estimates(scenario: Scenario) -> list[int]:
     """Returns the number of estimated parameters of each site, 0 for laws that do not learn."""
     counts = []
     for name in scenario.names:
-        learns = scenario.gains(name).law is Law.ADAPTIVE
+        learns = scenario.gains(name).is_adaptive
         counts.append(scenario.layout(name).parameters if learns else 0)
     return counts
 

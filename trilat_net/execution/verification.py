@@ -32,7 +32,6 @@ from ..core import (
     LawChannel,
     PlantState,
     Site,
-    StaleAction,
     TickInput,
     TickRepeater,
     compute_fingerprint,
@@ -401,7 +400,7 @@ class _SiteVerifier:
         # Under the stale rule "glide", the reference of a holding site does not depend on the
         # peers, unless its law reflects forces.
         reflects = setup.law_factory is not None or any(setup.gains.k_f)
-        self._detached = setup.on_stale.action is StaleAction.GLIDE and not reflects
+        self._detached = setup.on_stale.glides and not reflects
         self._starts = {boot: first for first, boot in log.starts.get(site, ())}
         self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
         self._last_tick = log.last_ticks[site]

@@ -15,10 +15,6 @@ from typing import TYPE_CHECKING
 from ..hooks import import_on_use
 
 __all__ = [
-    # Laws
-    "PD",
-    "Adaptive",
-    "complementary_shares",
     # The interface of a law
     "DAMPING",
     "ERROR_DAMPING",
@@ -35,19 +31,16 @@ __all__ = [
     "BlockKey",
     "LawSituation",
     "LinearForm",
-    "LinearSituation",
     "StabilityCondition",
 ]
 
 if TYPE_CHECKING:
-    from .adaptive import Adaptive
     from .conditions import (
         COMMON_MOTION_SHARE,
         ArmLoad,
         BlockKey,
         LawSituation,
         LinearForm,
-        LinearSituation,
         StabilityCondition,
     )
     from .interface import (
@@ -59,23 +52,18 @@ if TYPE_CHECKING:
         TuningRun,
         TuningSite,
     )
-    from .p_d import PD
     from .sent_vectors import SentVectorSpecs, convert_sends
-    from .six_channel import complementary_shares
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "adaptive": "Adaptive",
             "conditions": (
                 "ArmLoad BlockKey COMMON_MOTION_SHARE LawSituation LinearForm "
-                "LinearSituation StabilityCondition"
+                "StabilityCondition"
             ),
             "interface": (
                 "ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun TuningSite"
             ),
-            "p_d": "PD",
             "sent_vectors": "SentVectorSpecs convert_sends",
-            "six_channel": "complementary_shares",
         },
     )

@@ -33,6 +33,9 @@ from ..fields import (
 )
 from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlLaw, TuningSite
 
+_GRAVITY = slice(3, 5)
+"""Indices of the arm parameters of Eq. (24) that appear in the gravity torque."""
+
 
 class Adaptive(ControlLaw):
     """Adaptive law of the paper, which learns the dynamics of its arm, Eq. (13) and (15).
@@ -120,6 +123,22 @@ class Adaptive(ControlLaw):
             Gamma=self.Gamma,
             theta_hat0=self.theta_hat0,
         )
+
+    def find_sampling_excess(self, g_m_s2: float, tick_s: float) -> float | None:
+        """Returns Kp - Gamma g^2 h, which must be positive for the arm to come to rest.
+
+        If gravity is estimated too fast for the tick period h, the arm keeps swinging. This is
+        a rule of thumb for arms of about 1 m, because a factor of length squared, about 1 m^2,
+        is omitted. Only the gains of the parameters in the gravity torque matter, and the
+        largest of them is used.
+
+        Args:
+            g_m_s2: Gravitational acceleration g, m/s^2.
+            tick_s: Period h of a tick, s.
+        """
+        largest_gravity_gain = max(self.Gamma[_GRAVITY])
+        required_kp = largest_gravity_gain * g_m_s2**2 * tick_s
+        return min(self.Kp) - required_kp
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.

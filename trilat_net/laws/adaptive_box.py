@@ -46,6 +46,10 @@ class AdaptiveBox(Adaptive):
 
     known_facts: ClassVar = "gravity, as its first estimate; the box is around it"
 
+    def find_sampling_excess(self, g_m_s2: float, tick_s: float) -> None:  # noqa: ARG002
+        """Returns None, because no rule about the tick rate is known for bounded estimates."""
+        return
+
     def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
         """Returns the estimate after one time step of Eq. (15), clipped to its bounds.
 

@@ -396,6 +396,28 @@ class LinearForm:
         self.sends_acceleration = sends_acceleration
         self.blocks: dict[tuple[BlockKey, BlockKey], Array] = {}
 
+    @staticmethod
+    def list_forms(
+        names: tuple[str, ...], laws: tuple[Any, ...], alpha: Array, inertia: Sequence[Array]
+    ) -> "list[LinearForm | None]":
+        """Returns the linear terms that the gains of the laws of all sites cannot express.
+
+        Args:
+            names: Names of the sites.
+            laws: Settings of the control law of each site.
+            alpha: Dominance matrix in effect, shape (N, N). Row i contains the weights that
+                site i gives to the other sites.
+            inertia: Inertia matrix of each arm, shape (n, n) for n joints, kg m^2.
+
+        Returns:
+            The terms of each site, or None for a law that its gains describe completely.
+        """
+        forms: list[LinearForm | None] = []
+        for site, law in enumerate(laws):
+            situation = LinearSituation(site, names, laws, alpha, inertia[site])
+            forms.append(law.linear_form(situation))
+        return forms
+
     def add(self, row: BlockKey, column: BlockKey, gain: Any) -> None:
         """Adds a gain to one block of the matrix that describes a linearised control law.
 

@@ -26,10 +26,20 @@ from typing import Any, ClassVar, NamedTuple, cast, get_origin
 import msgspec
 from msgspec.structs import asdict
 
-from ..core import Array, Gains, Law, LawContext, UserLaw, UserLawFactory
+from ..core import (
+    Array,
+    Gains,
+    Law,
+    LawChannel,
+    LawContext,
+    SentVector,
+    UserLaw,
+    UserLawFactory,
+)
 from ..errors import ScenarioError, count_nouns
 from ..fields import Frozen, KeyProblem, NotNegative
 from ..files import find_page
+from ..records import Layout
 from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .sent_vectors import SentVectorSpecs, convert_sends
 
@@ -282,8 +292,52 @@ class LawSettings(Frozen, frozen=True):
 
         Empty for most laws.
         """
+        if self.kind is None:
+            return {}
         sends = getattr(self.kind, "sends", {})
         return convert_sends(sends, self.kind.__name__, "control")
+
+    def build_channel(self, layout: Layout, peers: int) -> LawChannel:
+        """Returns the vectors that the law sends from a site, with their lengths.
+
+        A law declares the vectors without knowing the arm. Their lengths follow from the
+        numbers of joints and coordinates.
+
+        Args:
+            layout: Numbers of the site's joints and coordinates.
+            peers: Number of the site's peers.
+        """
+        counts = {"joints": layout.joints, "coordinates": layout.shared}
+        vectors = []
+        for name, spec in self.sends.items():
+            length = spec.length
+            if not isinstance(length, int):
+                length = counts[length]
+            vectors.append(SentVector(name, spec.unit, length, spec.per_peer))
+        common_first = sorted(vectors, key=lambda vector: vector.per_peer)
+        return LawChannel(tuple(common_first), peers)
+
+    def find_uniform_spring(self) -> tuple[float, float] | None:
+        """Returns the gains of a law that is only a spring and a damper, equal at all joints.
+
+        Returns:
+            Stiffness K in N m/rad and damping d in N m s/rad. None for other laws and gains.
+        """
+        return None
+
+    def find_sampling_excess(self, g_m_s2: float, tick_s: float) -> float | None:  # noqa: ARG002
+        """Returns by how much a gain exceeds what the tick rate requires.
+
+        Overridden by laws that may be unstable because they act only once per tick.
+
+        Args:
+            g_m_s2: Gravitational acceleration, m/s^2.
+            tick_s: Period of a tick, s.
+
+        Returns:
+            The excess, positive if the gain is sufficient. None if no rule is known.
+        """
+        return None
 
     @staticmethod
     def check_class(

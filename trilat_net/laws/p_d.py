@@ -82,6 +82,16 @@ class PD(ControlLaw):
         """
         return situation.judge_position_exchange("d")
 
+    def find_uniform_spring(self) -> tuple[float, float] | None:
+        """Returns K in N m/rad and d in N m s/rad, if each is the same for all joints.
+
+        None for different gains, or if gravity compensation is not exact.
+        """
+        is_uniform = len({*self.K}) == 1 and len({*self.d}) == 1
+        if self.gravity != 1.0 or not is_uniform:
+            return None
+        return self.K[0], self.d[0]
+
     def exchanges_positions(self) -> bool:
         """Returns True if the law couples the arms like passive springs and dampers.
 

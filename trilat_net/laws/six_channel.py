@@ -2,7 +2,7 @@
 
 The factor a is the authority of user 1, and user 2 has the authority 1 - a. For a = 0.5, both
 users have equal influence on the slave. All dominance factors of the three arms are determined
-by a (see `complementary_shares`).
+by a (see `DominanceMatrix.complementary`).
 
 The torque is that of the four-channel law, which exchanges positions and forces
 (`FourChannel`). In addition, this law checks that the dominance factors of a scenario are
@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..core import Array
+from ..core import DominanceMatrix
 from .conditions import LawSituation, StabilityCondition
 from .four_channel import FourChannel
 
@@ -35,7 +35,8 @@ class SixChannel(FourChannel):
         """Evaluates the stability condition of the four-channel law for two users and a slave.
 
         The sites must be listed as user 1, user 2, slave. All dominance factors must be
-        consistent with a single factor a, the authority of user 1 (see `complementary_shares`).
+        consistent with a single factor a, the authority of user 1 (see
+        `DominanceMatrix.complementary`).
 
         Args:
             situation: The three sites and the dominance factors. Row i of `alpha` contains the
@@ -52,7 +53,7 @@ class SixChannel(FourChannel):
         user_1 = 0
         slave = 2
         a = float(situation.alpha[slave, user_1])  # the slave follows user 1 with the weight a
-        expected_shares = complementary_shares(a)
+        expected_shares = DominanceMatrix.complementary(a).alpha
         if not np.allclose(situation.alpha, expected_shares):
             text = (
                 "the shares are not those of one factor: see six_channel in "
@@ -69,34 +70,15 @@ class SixChannel(FourChannel):
         return StabilityCondition(condition.holds, prefix + condition.text)
 
 
-def complementary_shares(a: float) -> Array:
-    """Computes all dominance factors of two users and a slave from the single factor a.
-
-    The slave follows user 1 with the weight a and user 2 with 1 - a. User 1 follows user 2 with
-    1 - a and the slave with a. User 2 follows user 1 with a and the slave with 1 - a.
-
-    Args:
-        a: Authority of user 1, from 0 to 1. User 2 has 1 - a.
-
-    Returns:
-        Dominance matrix, shape (3, 3), in the order user 1, user 2, slave. Row i contains the
-        weights that arm i gives to the others.
-    """
-    user_1 = (0.0, 1.0 - a, a)
-    user_2 = (a, 0.0, 1.0 - a)
-    slave = (a, 1.0 - a, 0.0)
-    return np.array([user_1, user_2, slave])
-
-
 def complementary_weights(a: float) -> tuple[float, float, float]:
     """Computes the weights beta with which the operators' torques add up to zero at rest.
 
     While all arms rest, sum_i beta_i tau_i = 0, where tau_i is the external torque on arm i, in
     N m.
 
-    The weights follow from the dominance matrix A (see `complementary_shares`). At rest,
-    springs balance the external torques: tau = K (q - A q), where K is the stiffness and q are
-    the positions. Therefore beta satisfies beta A = beta, that is,
+    The weights follow from the dominance matrix A (see `DominanceMatrix.complementary`). At
+    rest, springs balance the external torques: tau = K (q - A q), where K is the stiffness and
+    q are the positions. Therefore beta satisfies beta A = beta, that is,
 
         beta_1 = a beta_2 + a beta_3
         beta_2 = (1 - a) beta_1 + (1 - a) beta_3

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from ..core import LINK_PARAMETERS, POSE, POSITION
 from ..errors import LogError
-from ..files import import_extra
+from ..files import Extra
 from ..net import Event, LinkStats, State, json_schema
 from ..records import NS_PER_S
 from ..scenario import TASK_AXES, ArmModel, Scenario
@@ -57,6 +57,7 @@ UNIT_SUFFIXES = {
 """Maps each unit to the last part of a column's name."""
 EVENTS_TABLE = "events"
 """Name of the table with the events."""
+_FRAMES = Extra("frames", "data frames")
 SITE_TABLE_KINDS = ("state", "link", "arrivals")
 """Kinds of tables available for each site."""
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
@@ -189,7 +190,7 @@ class Table:
         Raises:
             UsageError: polars is not installed.
         """
-        pl = import_extra("polars", "frames", "data frames")
+        pl = _FRAMES.import_module("polars")
         all_series = []
         for column in self.columns:
             if column.is_text:
@@ -216,7 +217,7 @@ class Table:
                 values[column.name] = column.rows(0, len(column.values))
             else:
                 values[column.name] = column.numbers()
-        return import_extra("pandas", "frames", "data frames").DataFrame(values)
+        return _FRAMES.import_module("pandas").DataFrame(values)
 
     @classmethod
     def of_states(cls, site: SiteLog, scenario: Scenario) -> "Table":
@@ -804,8 +805,6 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
     """
     used_ticks = site.used[peer]
     known: NDArray[np.bool_] = used_ticks >= 0  # -1 before the first sample
-    stamps_ns = used_ticks * NS_PER_S // rate_hz
-    age_ms = (site.t_ns - stamps_ns) / 1e6
     source = f"used.{peer}"
     yield Column(
         name=f"used_{peer}_tick",
@@ -817,7 +816,7 @@ def _make_sample_columns(site: SiteLog, peer: str, rate_hz: int) -> Iterator[Col
     )
     yield Column(
         name=f"age_{peer}_ms",
-        values=age_ms,
+        values=site.age_ns(peer, rate_hz) / 1e6,
         unit="ms",
         meaning=f"time since the stamp of the sample from {peer} in use",
         source=f"t_ns, {source}",

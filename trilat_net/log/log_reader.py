@@ -42,7 +42,6 @@ from ..errors import (
     count_nouns,
     suggest_nearest,
 )
-from ..files import describe_missing_library
 from ..hooks import find_hook
 from ..net import (
     READABLE,
@@ -54,7 +53,7 @@ from ..net import (
     topics,
 )
 from ..own_code import LawFiles, allow_logged_code
-from ..records import NS_PER_S
+from ..package_names import describe_missing_library
 from ..results import Result
 from ..scenario import (
     FAILED_HAND,
@@ -855,12 +854,12 @@ class Log(Result, Mapping[str, SiteLog]):
                 index: peer for index, peer in enumerate(peers) if peer not in stated
             }
             if not peers_without_end:
-                continue  # avoids decoding all records
-            for state in self[name].states:
-                for index, tick, _ in state.rx:
-                    peer = peers_without_end.get(index)
-                    if peer is not None and tick < self.scenario.ticks(peer):
-                        last_ticks[peer] = max(last_ticks[peer], tick)
+                continue  # avoids decoding all arrivals
+            _, arrivals = self[name].arrivals
+            for index, peer in peers_without_end.items():
+                received_ticks = arrivals[arrivals[:, 0] == index, 1]
+                possible_ticks = received_ticks[received_ticks < self.scenario.ticks(peer)]
+                last_ticks[peer] = int(possible_ticks.max(initial=last_ticks[peer]))
         return last_ticks
 
     def __getitem__(self, site: str) -> SiteLog:
@@ -983,11 +982,8 @@ class Log(Result, Mapping[str, SiteLog]):
         Returns:
             The ages, in ns. Ticks before the first sample came into use are left out.
         """
-        site_log = self[site]
-        used = site_log.used[peer]
-        has_sample = used >= 0
-        stamp_ns = used[has_sample] * NS_PER_S // self.scenario.sites[peer].rate_hz
-        return site_log.tick[has_sample] * NS_PER_S // site_log.rate_hz - stamp_ns
+        ages_ns = self[site].age_ns(peer, self.scenario.sites[peer].rate_hz)
+        return ages_ns[self[site].used[peer] >= 0]
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published about its network links, such as losses.

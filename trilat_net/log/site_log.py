@@ -15,7 +15,6 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
-from itertools import pairwise
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -767,8 +766,8 @@ class SiteLog:
         """
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
-    def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Computes the age of the peer's sample that the control law used in each record, in s.
+    def age_ns(self, peer: str, rate_hz: int) -> Ints:
+        """Computes the age of the sample that the control law used in each record, in ns.
 
         The age is the time of the record minus the stamp of the sample. The stamp is the
         nominal time of the tick in which the peer computed the sample.
@@ -778,12 +777,26 @@ class SiteLog:
             rate_hz: Tick rate of the peer, in Hz.
 
         Returns:
+            The ages, shape (K,), in ns. They have no meaning before the first sample, where the
+            tick in `used` is -1.
+        """
+        stamps_ns = self.used[peer] * NS_PER_S // rate_hz
+        return self.t_ns - stamps_ns
+
+    def age_s(self, peer: str, rate_hz: int) -> Array:
+        """Computes the age of the peer's sample that the control law used in each record, in s.
+
+        `age_ns` defines the age.
+
+        Args:
+            peer: Name of the peer.
+            rate_hz: Tick rate of the peer, in Hz.
+
+        Returns:
             The ages, shape (K,), in s. NaN before the first sample.
         """
-        used_ticks = self.used[peer]
-        stamps_ns = used_ticks * NS_PER_S // rate_hz
-        age_ns = self.t_ns - stamps_ns
-        return np.where(used_ticks >= 0, age_ns / NS_PER_S, np.nan)
+        has_sample = self.used[peer] >= 0
+        return np.where(has_sample, self.age_ns(peer, rate_hz) / NS_PER_S, np.nan)
 
     def iterate_delays(
         self, peer: str, rate_hz: int, sent_ticks: Sequence[int]
@@ -803,13 +816,17 @@ class SiteLog:
         Yields:
             The stamp in s after the start of the session, and the delay in ms.
         """
-        sender_index = self.peers.index(peer)
-        delays_us: dict[int, int] = {}
-        for state in self.states:
-            for sender, tick, delay_us in state.rx:
-                if sender == sender_index and tick >= 0:
-                    earlier_us = delays_us.get(tick, MAX_DELAY_US)
-                    delays_us[tick] = min(earlier_us, max(delay_us, 0))
+        _, arrivals = self.arrivals
+        is_from_peer = (arrivals[:, 0] == self.peers.index(peer)) & (arrivals[:, 1] >= 0)
+        arrived_ticks, sample_of_arrival = np.unique(
+            arrivals[is_from_peer, 1], return_inverse=True
+        )
+        # A sample may arrive several times, and its shortest delay counts.
+        shortest_us = np.full(len(arrived_ticks), MAX_DELAY_US)
+        arrival_delays_us = np.maximum(arrivals[is_from_peer, 2], 0)
+        np.minimum.at(shortest_us, sample_of_arrival, arrival_delays_us)
+        pairs = zip(arrived_ticks.tolist(), shortest_us.tolist(), strict=True)
+        delays_us: dict[int, int] = dict(pairs)
         if not delays_us:
             return
 
@@ -842,14 +859,13 @@ class SiteLog:
         Returns:
             The intervals (start, end), in ns after the start of the session.
         """
-        states = self.states
-        if not states:
+        if not len(self):
             return [(0, math.inf)]
-        gaps: list[tuple[int, float]] = []
-        for record, next_record in pairwise(states):
-            if next_record.tick != record.tick + 1:
-                gaps.append((record.t_ns, next_record.t_ns))
-        if states[0].tick > 0:
-            gaps.append((0, states[0].t_ns))
-        gaps.append((states[-1].t_ns, math.inf))
+        rows = np.flatnonzero(np.diff(self.tick) != 1)
+        gap_starts = self.t_ns[rows].tolist()
+        gap_ends = self.t_ns[rows + 1].tolist()
+        gaps: list[tuple[int, float]] = list(zip(gap_starts, gap_ends, strict=True))
+        if self.tick[0] > 0:
+            gaps.append((0, int(self.t_ns[0])))
+        gaps.append((int(self.t_ns[-1]), math.inf))
         return gaps

@@ -23,6 +23,7 @@ __all__ = [
     "OPERATOR",
     "ROLES",
     "ROUTER",
+    "SITE_ROLE",
     "Bus",
     "Connection",
     "DefaultEndpoints",
@@ -30,13 +31,8 @@ __all__ = [
     "Inbox",
     "Query",
     "QueryInbox",
-    "RouterSilent",
     "StampedInbox",
-    "ZenohBus",
     "check_hosts",
-    "describe_role",
-    "find_free_endpoints",
-    "is_loopback",
     "make_site_known",
     "matches_key",
     "open_zenoh",
@@ -48,7 +44,6 @@ __all__ = [
     "HERE",
     "MEMBERS",
     "PRIVATE_KEY",
-    "MemberKeys",
     "add_keys",
     "create_keys",
     "read_member_keys",
@@ -140,14 +135,7 @@ if TYPE_CHECKING:
     from .arm_client import ArmClient, Hand, HandSender, SiteClient, SwitchClient
     from .bus import Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key
     from .clock import Clock, SystemClock
-    from .connection import (
-        ENCRYPTED,
-        ENDS_SOON,
-        Connection,
-        DefaultEndpoints,
-        find_free_endpoints,
-        is_loopback,
-    )
+    from .connection import ENCRYPTED, ENDS_SOON, Connection, DefaultEndpoints
     from .discovery import connect_to_session
     from .host_names import check_hosts
     from .known_sites import make_site_known, stop_at_once
@@ -157,7 +145,6 @@ if TYPE_CHECKING:
         HERE,
         MEMBERS,
         PRIVATE_KEY,
-        MemberKeys,
         add_keys,
         create_keys,
         read_member_keys,
@@ -231,8 +218,8 @@ if TYPE_CHECKING:
         make_sample_reader,
         split_states,
     )
-    from .zenoh_bus import RouterSilent, ZenohBus, open_zenoh, share_threads
-    from .zenoh_config import BRIDGE, OPERATOR, ROLES, ROUTER, Endpoint, describe_role
+    from .zenoh_bus import open_zenoh, share_threads
+    from .zenoh_config import BRIDGE, OPERATOR, ROLES, ROUTER, SITE_ROLE, Endpoint
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -240,16 +227,13 @@ else:
             "arm_client": "ArmClient Hand HandSender SiteClient SwitchClient",
             "bus": "Bus Inbox Query QueryInbox StampedInbox matches_key",
             "clock": "Clock SystemClock",
-            "connection": (
-                "Connection DefaultEndpoints ENCRYPTED ENDS_SOON find_free_endpoints "
-                "is_loopback"
-            ),
+            "connection": "Connection DefaultEndpoints ENCRYPTED ENDS_SOON",
             "discovery": "connect_to_session",
             "host_names": "check_hosts",
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
-                "AUTHORITY CERTIFICATE HERE MEMBERS MemberKeys PRIVATE_KEY add_keys "
-                "create_keys read_member_keys renew_keys"
+                "AUTHORITY CERTIFICATE HERE MEMBERS PRIVATE_KEY add_keys create_keys "
+                "read_member_keys renew_keys"
             ),
             "membership": (
                 "Epoch EventPublisher LateSites describe_member new_boot read_messages"
@@ -278,7 +262,7 @@ else:
                 "MAX_BYTES decode encode encode_sample encode_state join_states "
                 "make_decoder make_sample_reader split_states"
             ),
-            "zenoh_bus": "RouterSilent ZenohBus open_zenoh share_threads",
-            "zenoh_config": "BRIDGE Endpoint OPERATOR ROLES ROUTER describe_role",
+            "zenoh_bus": "open_zenoh share_threads",
+            "zenoh_config": "BRIDGE Endpoint OPERATOR ROLES ROUTER SITE_ROLE",
         },
     )

@@ -111,18 +111,6 @@ class DefaultEndpoints:
             yield endpoints
 
 
-def find_free_endpoints(count: int) -> list[str]:
-    """Returns endpoints on this machine whose ports are currently unused.
-
-    Another program may take a port before the caller does.
-
-    Args:
-        count: Number of endpoints to find.
-    """
-    with ExitStack() as stack:
-        return _bind_ports(stack, [0] * count, shared=False)
-
-
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
     """Reserves ports of this machine for sites that will listen on them.
 
@@ -213,6 +201,18 @@ class Connection:
         Empty if the endpoints are not known yet.
         """
         return find_endpoint_addresses(self.reach(self.connect or ()))
+
+    @property
+    def unprotected_addresses(self) -> list[str]:
+        """Addresses that are neither encrypted nor limited to this machine.
+
+        Anybody on the network of such an address can read the messages and take part.
+        """
+        return [
+            address
+            for address in (*self.listen_addresses, *self.connect_addresses)
+            if not (address.startswith(ENCRYPTED) or _is_loopback(address))
+        ]
 
     def open(self) -> ZenohBus:
         """Opens the network connection of this process, as described by the attributes.
@@ -537,7 +537,7 @@ def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
     has_mutual_tls = link_settings.get("tls", {}).get("enable_mtls") is True
     for address in find_endpoint_addresses(connection.listen):
         is_certified = has_mutual_tls and address.startswith(ENCRYPTED)
-        is_safe = insecure or is_loopback(address) or is_certified
+        is_safe = insecure or _is_loopback(address) or is_certified
         if not is_safe:
             raise UsageError(
                 f"--listen {address}: anybody on that network could take part: give "
@@ -550,7 +550,7 @@ ENCRYPTED = ("tls/", "quic/")
 """Prefixes of the endpoints whose transport is encrypted."""
 
 
-def is_loopback(address: str) -> bool:
+def _is_loopback(address: str) -> bool:
     """Returns True if an address can only be reached from this machine.
 
     Such addresses need no encryption, because other machines cannot connect to them.

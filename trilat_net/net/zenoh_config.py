@@ -576,7 +576,7 @@ class _Role(NamedTuple):
     publishes_to: tuple[str, ...] = ()
 
 
-_SITE_ROLE = _Role(
+SITE_ROLE = _Role(
     publishes=(
         topics.SAMPLE,
         topics.STATE,
@@ -617,47 +617,6 @@ ROLES = {
     ),
 }
 """Mapping from the name of each member that is not a site to its role."""
-_CHANNEL_WORDS = {
-    topics.SAMPLE: "samples",
-    topics.STATE: "records",
-    topics.LINK: "statistics of its loop and links",
-    topics.EVENT: "events",
-    topics.MEASURED: "measurements of an external arm",
-    topics.VIEW: "views for an operator's program",
-    topics.STATS: "statistics of the recording",
-    topics.HAND: "live hands",
-    topics.ENABLE: "reports of a dead-man switch",
-    topics.SET: "all orders, such as set, enable and reset",
-    topics.STOP: "the order to stop",
-}
-"""Description of the messages of each channel, for the user."""
-
-
-def describe_role(member: str) -> list[str]:
-    """Describes what a member with keys may send, with one line per kind of receiver.
-
-    Replies, queries for information and liveliness tokens are left out, because every member
-    may send them.
-
-    Args:
-        member: Name of the member, which determines its role.
-    """
-    if member == ROUTER:
-        return ["forwards the messages of all members, whatever they contain"]
-    permissions = ROLES.get(member, _SITE_ROLE)
-    request_channels = [
-        channel for channel in permissions.queries if channel in (topics.SET, topics.STOP)
-    ]
-    to_others = [
-        _CHANNEL_WORDS[channel] for channel in (*permissions.publishes_to, *request_channels)
-    ]
-    descriptions = []
-    if permissions.publishes:
-        published = [_CHANNEL_WORDS[channel] for channel in permissions.publishes]
-        descriptions.append(f"may send in its own name: {', '.join(published)}")
-    if to_others:
-        descriptions.append(f"may send to every site: {', '.join(to_others)}")
-    return descriptions
 
 
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
@@ -676,7 +635,7 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
             keys = [f"{topics.ROOT}/**"]
             member_rules = [_make_rule(["ingress", "egress"], _ALL_MESSAGES, keys)]
         else:
-            member_rules = list(_derive_rules(member, ROLES.get(member, _SITE_ROLE)))
+            member_rules = list(_derive_rules(member, ROLES.get(member, SITE_ROLE)))
         # A role without channels of some kind gives a rule without keys.
         member_rules = [rule for rule in member_rules if rule["key_exprs"]]
 

@@ -40,8 +40,6 @@ __all__ = [
     "name_law_classes",
     "read_code",
     # Vectors that a law sends
-    "build_channel",
-    "check_sends",
     "parse_classes",
     "read_sends",
 ]
@@ -68,7 +66,7 @@ if TYPE_CHECKING:
         name_law_classes,
         read_code,
     )
-    from .sent_channel import build_channel, check_sends, parse_classes, read_sends
+    from .sent_channel import parse_classes, read_sends
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -82,6 +80,6 @@ else:
                 "CLASS_PATTERN CodeConsents CodeKey ImportedLaw Watch allowed_code "
                 "allowing_any_settings call_directly name_law_classes read_code"
             ),
-            "sent_channel": "build_channel check_sends parse_classes read_sends",
+            "sent_channel": "parse_classes read_sends",
         },
     )

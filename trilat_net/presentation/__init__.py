@@ -20,7 +20,6 @@ __all__ = [
     "Block",
     "MarkedText",
     "TextTable",
-    "compose",
     "compose_benchmark",
     "compose_citation",
     "compose_doctor",
@@ -74,7 +73,7 @@ if TYPE_CHECKING:
     from .linear_text import describe_moving_states
     from .observed_text import NEGATIVE_ENERGY_MEANING
     from .rerun_viewer import ViewerOptions, open_rerun
-    from .result_text import MARKS, Block, MarkedText, TextTable, compose, format_number
+    from .result_text import MARKS, Block, MarkedText, TextTable, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
     from .summary_text import compose_benchmark, compose_doctor, compose_ping
     from .terminal_output import err, print_error, print_json, print_line, print_table
@@ -95,7 +94,7 @@ else:
             "linear_text": "describe_moving_states",
             "observed_text": "NEGATIVE_ENERGY_MEANING",
             "rerun_viewer": "ViewerOptions open_rerun",
-            "result_text": "Block MARKS MarkedText TextTable compose format_number",
+            "result_text": "Block MARKS MarkedText TextTable format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
             "summary_text": "compose_benchmark compose_doctor compose_ping",
             "terminal_output": (

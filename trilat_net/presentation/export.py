@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import UsageError
-from ..files import import_extra, refuse_existing, stage_output
+from ..files import Extra, refuse_existing, stage_output
 from ..log import SCENARIO, Log, Progress, Table, collect_provenance
 from ..results import JsonObject
 from . import exports
@@ -42,15 +42,16 @@ class ExportFormat(NamedTuple):
             or `None`.
         ending: Suffix of the default output path, which is appended to the name of the log.
         folder: True if the format writes a folder.
-        extra: If the format needs an optional package, the arguments for `import_extra`: the
-            module, the extra that installs it, and the features that need it. Otherwise empty.
+        extra: Group of optional packages that the format needs. `None` if it needs none.
+        module: Module of the group that the format imports.
         many: True if the format accepts several logs.
     """
 
     write: Callable[..., str | None]
     ending: str
     folder: bool = False
-    extra: tuple[str, str, str] | tuple[()] = ()
+    extra: Extra | None = None
+    module: str = ""
     many: bool = False
 
 
@@ -101,7 +102,7 @@ class Exporter:
         self._manifest = EXPORT_MANIFEST if self._format.folder else None
         refuse_existing(self.path, force=force, manifest=self._manifest)
         if self._format.extra:
-            import_extra(*self._format.extra)
+            self._format.extra.import_module(self._format.module)
 
     def export(self, *logs: Log, progress: Progress = lambda _done, _total: None) -> str:
         """Writes the logs in the chosen format, for example as CSV tables.

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import RunFailed, UsageError
-from ..files import import_extra
+from ..files import Extra
 from ..log import ACTIVE_SUFFIX, Log
 from ..log.ros2 import (
     DIAGNOSTICS,
@@ -41,11 +41,12 @@ from ..log.ros2 import (
     Ros2Channels,
     Ros2Topics,
 )
-from .exports.ros2 import export_ros2
+from .export import Exporter
 
 RunCommand = Callable[[list[str], Mapping[str, str]], int]
 """Function that runs a command with the given environment and returns the exit code."""
 
+_EXTRA = Extra("view", "viewers")
 _PROGRAM = (sys.executable, "-m", "rerun")
 _LOOPBACK = "127.0.0.1"
 _QUIET_ENVIRONMENT = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
@@ -93,7 +94,7 @@ def open_rerun(
         LogError: The log cannot be read.
         RunFailed: Rerun exited with an error.
     """
-    import_extra("rerun", "view", "viewers")
+    _EXTRA.import_module("rerun")
     _require_display(options)
     with tempfile.TemporaryDirectory(prefix="trilat-view-") as folder:
         path = paths[0]
@@ -104,7 +105,7 @@ def open_rerun(
         must_export = options.full or has_several_parts or not Ros2Topics.of_file(path)
         if must_export:
             print_line("making standard channels of every record ...")
-            export_ros2(read_log(), named_path)
+            Exporter("ros2", named_path).export(read_log())
             path = named_path
         elif path.name != named_path.name:
             named_path.symlink_to(path.resolve())
@@ -504,7 +505,7 @@ def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
     Raises:
         UsageError: Rerun is not installed.
     """
-    rrb = import_extra("rerun.blueprint", "view", "viewers")
+    rrb = _EXTRA.import_module("rerun.blueprint")
     views = []
     for name, page in layout.pages.items():
         rows = []
@@ -561,7 +562,7 @@ def _style_curves(curves: _PlotCurves, first_color: int) -> Any:
         curves: The curves.
         first_color: Colour index of the first curve. Further curves use the next colours.
     """
-    rr = import_extra("rerun", "view", "viewers")
+    rr = _EXTRA.import_module("rerun")
     pale_palette = cycle(_PALE_COLORS)
     strong_palette = cycle(_COLORS[first_color:] + _COLORS[:first_color])
     colors = []

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from ..errors import count_nouns
+from ..errors import count_nouns, format_wall_time
 from .untrusted_text import CONTROLS, MAX_LETTERS, sanitize
 
 if TYPE_CHECKING:
@@ -58,6 +58,8 @@ err = TextConsole(stderr=True, highlight=False)
 
 PATIENCE_S = 1.0
 """Time after which a progress bar appears, in s."""
+_RUN_LINES = 10
+"""Number of lines that show the progress of many runs if the output is not a terminal."""
 _REDRAW_PERIOD_S = 0.1
 """Minimum time between two updates of a progress bar, in s."""
 LINES_AFTER_S = 1.0
@@ -311,6 +313,70 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         yield show
     finally:
         display.stop()
+
+
+@contextmanager
+def show_progress(
+    label: str, print_line: Callable[[str], None], items: str = "runs"
+) -> Iterator[Callable[[int, int], None]]:
+    """Context manager that shows the progress of many runs, which may take hours.
+
+    In a terminal, a bar is shown. If the output is a file or a pipe, at most `_RUN_LINES` lines
+    with the remaining time are printed instead, and as many again whenever the total number of
+    items grows, as in a sweep that is refined.
+
+    Args:
+        label: Label of the bar.
+        print_line: Function that prints a line.
+        items: What is being counted, as a plural noun.
+
+    Yields:
+        A function to call with the number of finished items and the total number of items.
+    """
+    if err.is_interactive:
+        with progress_bar(label) as show:
+            yield show
+        return
+
+    from ..net import SystemClock
+
+    clock = SystemClock()
+    first_call_ns = -1  # time of the first call of `show_line`, -1 before it
+    done_at_first_call = 0
+    printed_tenths = 0  # tenths of the items that were finished at the last printed line
+    last_total = 0
+
+    def show_line(done: int, total: int) -> None:
+        """Prints a line with the remaining time, about once per tenth of the items.
+
+        The remaining time is estimated from the mean duration per item since the first call.
+        The first call prints no line because this duration is not known yet, and no line is
+        printed after the last item.
+
+        Args:
+            done: Number of finished items.
+            total: Total number of items.
+        """
+        nonlocal first_call_ns, done_at_first_call, printed_tenths, last_total
+        if first_call_ns < 0:
+            # The time before the first item is the start of the processes, which does not
+            # count towards the duration of an item.
+            first_call_ns = clock.monotonic_ns()
+            done_at_first_call = done
+        finished_tenths = done * _RUN_LINES // total
+        if total != last_total:
+            last_total = total
+            printed_tenths = finished_tenths
+        has_no_remaining_time = done in (total, done_at_first_call)
+        if has_no_remaining_time or finished_tenths <= printed_tenths:
+            return
+
+        printed_tenths = finished_tenths
+        elapsed_s = (clock.monotonic_ns() - first_call_ns) * 1e-9
+        remaining_s = elapsed_s / (done - done_at_first_call) * (total - done)
+        print_line(f"  {done} of {total} {items}, about {format_wall_time(remaining_s)} left")
+
+    yield show_line
 
 
 def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":

@@ -32,13 +32,11 @@ from ..core import (
     FramePose,
     Gains,
     HandReach,
-    Law,
     MotionLimits,
     RestGains,
     TaskSetup,
     Three,
     Vector,
-    rotation_matrix,
 )
 from ..errors import ScenarioError, count_nouns
 from .key_checks import VectorCounts, field_names
@@ -594,7 +592,7 @@ class ArmModel(NamedTuple):
             g_m_s2: Gravitational acceleration, in m/s^2. If 0, no bounds are added.
         """
         has_box = np.isfinite(gains.low).any()
-        if gains.law is not Law.ADAPTIVE or has_box or g_m_s2 == 0.0:
+        if not gains.is_adaptive or has_box or g_m_s2 == 0.0:
             return gains
         if self.chain is None:
             low, high = _bound_planar_parameters(self, limit_nm, g_m_s2)
@@ -755,10 +753,10 @@ def _place_base(
     if not (any(arm.base_xyz_m) or any(arm.base_rpy_rad)):
         return joints, gravity
     roll, pitch, yaw = arm.base_rpy_rad
-    R_x = rotation_matrix((roll, 0.0, 0.0))
-    R_y = rotation_matrix((0.0, pitch, 0.0))
-    R_z = rotation_matrix((0.0, 0.0, yaw))
-    turn = FramePose(R_z) @ (FramePose(R_y) @ FramePose(R_x))
+    roll_turn = FramePose.from_rotation_vector((roll, 0.0, 0.0))
+    pitch_turn = FramePose.from_rotation_vector((0.0, pitch, 0.0))
+    yaw_turn = FramePose.from_rotation_vector((0.0, 0.0, yaw))
+    turn = yaw_turn @ (pitch_turn @ roll_turn)
     x, y, z = arm.base_xyz_m
     base = FramePose(turn.rotation, (x, y, z))
     first = joints[0]

@@ -23,7 +23,6 @@ from ..core import (
     REST_RATE_1_S,
     Array,
     ChainDynamics,
-    Law,
     SiteSetup,
 )
 from .arms import Arm, ArmModel
@@ -162,7 +161,7 @@ def _bound_rest_time(
     braking_s = float(setup.rest.stop_s(speed)) + math.sqrt(2.0 * energy_j * slowness)
 
     # The joints return to the pose that they hold, with an exponential rate.
-    adapts = setup.gains.law is Law.ADAPTIVE and not setup.layout.task
+    adapts = setup.gains.is_adaptive and not setup.layout.task
     rate_1_s = float(np.min(setup.gains.Lambda)) if adapts else REST_RATE_1_S
     time_s = setup.rest.time_s
     fastest_rad_s = float((limit_nm / setup.rest.damping).max())

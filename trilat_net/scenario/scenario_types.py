@@ -30,14 +30,13 @@ from ..core import (
     LinkSetup,
     MotionLimits,
     RestGains,
-    Scheme,
     SiteSetup,
     link_key,
 )
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
-from ..laws import LawSettings, LawSituation, SentVectorSpecs, StabilityCondition
-from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, build_channel, list_named_code
+from ..laws import LawSettings, LawSituation, StabilityCondition
+from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, list_named_code
 from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
 from .arms import START_MARGIN_RAD, ArmModel, build_arm, start_margin
@@ -79,7 +78,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         assumed: Assumptions made where the source of the experiment is silent.
         duration_s: Duration of the run, in s.
         seed: Random seed, of which every random draw is a function.
-        scheme: Integration scheme, "second_order" or "digital" (see `Scheme`).
+        scheme: Integration scheme, "second_order" or "digital" (see `SiteSetup.digital`).
         sites: Ordered mapping from site name to site. The first site leads a live session.
         dominance: Matrix of dominance factors, Eq. (6). The entry in row i and column j is the
             weight of site j in the reference of site i.
@@ -580,9 +579,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         Args:
             site: Name of the site.
         """
-        sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
         layout = SiteSetup.make_layout(self.arms[site].chain)
-        return build_channel(sends, layout, len(self.names) - 1)
+        return self.sites[site].control.build_channel(layout, len(self.names) - 1)
 
     def layout(self, site: str) -> Layout:
         """Returns the lengths of all vectors in the log of a site.
@@ -648,7 +646,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         return SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
-            scheme=Scheme[self.scheme.upper()],
+            digital=self.scheme == "digital",
             gains=self.gains(site),
             theta=arm.theta,
             g_m_s2=spec.arm.g_m_s2,

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from ..core import SCRIPTED_KINDS, Array, MotionLimits, StaleAction, StaleRule, TorqueKind
+from ..core import SCRIPTED_KINDS, Array, MotionLimits, StaleRule, TorqueKind
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws import ArmLoad
 from ..own_code import ImportedLaw
@@ -65,15 +65,14 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
         integers.
         """
         if self.action == "glide":
-            return StaleRule(
-                action=StaleAction.GLIDE,
+            return StaleRule.glide(
                 age_ns=round(self.silence_ms * 1e6),
                 align_speed=self.align_speed_rad_s,
                 align_limit=self.align_limit_rad,
                 degrades=self.on_lost == "degrade",
             )
-        return StaleRule(
-            action=StaleAction[self.action.upper()],
+        return StaleRule.by_age(
+            self.action,
             age_ns=round(self.age_ms * 1e6),
             return_ns=round(self.return_s * 1e9),
         )

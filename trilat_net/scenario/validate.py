@@ -31,7 +31,7 @@ from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable
 from ..files import find_page
 from ..laws import LawSettings
-from ..own_code import ImportedLaw, check_sends
+from ..own_code import ImportedLaw
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .change import Change
@@ -251,7 +251,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     for name, site in scenario.sites.items():
         _check_law(name, site, len(scenario.sites))
         joints = scenario.layout(name).joints
-        check_sends(scenario.channel(name), joints, f"sites.{name}.control")
+        scenario.channel(name).check_vectors(joints, f"sites.{name}.control")
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_hands(site, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")

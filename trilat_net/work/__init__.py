@@ -1,8 +1,8 @@
 """Infrastructure for studies of many runs: workers, result folders, confidence intervals.
 
 Sweeps, tunings and benchmarks use this package. `executor` distributes their runs to worker
-processes, `study_folder` stores each finished run so that an interrupted study can continue,
-and `intervals` computes the uncertainty of the results.
+processes, `run_journal` stores each finished run so that an interrupted study can continue, and
+`intervals` computes the uncertainty of the results.
 """
 
 from typing import TYPE_CHECKING
@@ -15,10 +15,8 @@ __all__ = [
     "Progress",
     "WorkerPool",
     "Workers",
-    "ignore_progress",
-    # Folders of studies
+    # Results of the runs
     "RunJournal",
-    "StudyFolder",
     "encode_csv",
     # Intervals of confidence
     "MeanInterval",
@@ -26,15 +24,15 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from .executor import MAX_LOSSES, Progress, WorkerPool, Workers, ignore_progress
+    from .executor import MAX_LOSSES, Progress, WorkerPool, Workers
     from .intervals import MeanInterval, wilson_interval
-    from .study_folder import RunJournal, StudyFolder, encode_csv
+    from .run_journal import RunJournal, encode_csv
 else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "executor": "MAX_LOSSES Progress WorkerPool Workers ignore_progress",
+            "executor": "MAX_LOSSES Progress WorkerPool Workers",
             "intervals": "MeanInterval wilson_interval",
-            "study_folder": "RunJournal StudyFolder encode_csv",
+            "run_journal": "RunJournal encode_csv",
         },
     )

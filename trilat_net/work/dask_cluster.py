@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 from ..core import compute_fingerprint
 from ..errors import RunFailed, ScenarioError, UsageError
-from ..files import import_extra
+from ..files import Extra
 from ..log import collect_provenance
 from ..net import SystemClock, check_hosts
 from ..own_code import read_code
@@ -45,7 +45,7 @@ def _import_distributed() -> Any:
     Raises:
         UsageError: The package is not installed.
     """
-    return import_extra("distributed", "cluster", "clusters")
+    return Extra("cluster", "clusters").import_module("distributed")
 
 
 WorkerIdentity = Mapping[str, str]

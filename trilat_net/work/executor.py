@@ -30,9 +30,9 @@ from itertools import islice
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from ..errors import RunFailed, UsageError
-from ..files import require_libraries
 from ..net import SystemClock
 from ..own_code import CodeConsents, allowed_code, allowing_any_settings
+from ..package_names import require_libraries
 from ..workers import count_cores, worker_pool
 from .dask_cluster import DaskCluster, WorkerRequirements
 
@@ -65,10 +65,6 @@ _POLL_S = 1.0
 """Interval between checks of a cluster while no batch ends, in s."""
 _MAX_NAME = 200
 """Largest number of characters of an item's name in an error message."""
-
-
-def ignore_progress(_done: int, _total: int) -> None:
-    """Does nothing. The default progress callback for callers that display no progress."""
 
 
 class _BatchResult(NamedTuple):
@@ -460,7 +456,7 @@ class WorkerPool:
         self,
         function: Callable[[T], R],
         items: Sequence[T],
-        progress: Progress = ignore_progress,
+        progress: Progress | None = None,
         together: Together[T, R] | None = None,
         together_count: int = 1,
     ) -> list[R]:
@@ -471,7 +467,7 @@ class WorkerPool:
         Args:
             function: Module-level function, so that other processes can import it.
             items: The items, each passed to one call.
-            progress: Function that is called each time an item is finished.
+            progress: Function that is called each time an item is finished, if any.
             together: Function that replaces `function` for several items at once.
             together_count: Number of items to pass to `together`.
 
@@ -491,7 +487,8 @@ class WorkerPool:
             together_count=together_count,
         ):
             results[number] = result
-            progress(len(results), len(items))
+            if progress is not None:
+                progress(len(results), len(items))
         return [results[number] for number in range(len(items))]
 
     def _submit(

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from trilat_net.app import options, show_progress, value
+from trilat_net.app import options, value
 from trilat_net.errors import count_nouns
 from trilat_net.presentation import terminal_output as terminal
 
@@ -110,7 +110,7 @@ def experiment_run_command(
 
             exit_code = run_with_people(experiment, page, terminal.print_line)
         else:
-            with show_progress("trials", terminal.print_text) as show:
+            with terminal.show_progress("trials", terminal.print_text) as show:
                 experiment.run(jobs, show, on)
     terminal.print_result(experiment, as_json=as_json)
     if exit_code:

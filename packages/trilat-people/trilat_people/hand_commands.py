@@ -107,11 +107,9 @@ def _lead_by_device(
         reach: Command-line options for connecting to the session.
         timeout_s: Maximum time to wait for the site, in s.
     """
-    from trilat_net.app import RunningSession
-
     from .devices import open_device
 
-    running = RunningSession(options.check_session_name(session or ""), reach.resolve())
+    running = reach.open_session(session or "")
     opened_device = open_device(device)
     with Interrupt() as interrupt:
         running.lead(

@@ -26,8 +26,8 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
-from trilat_net.app import RunningSession, open_hand
-from trilat_net.errors import TrilatError, UsageError, count_nouns
+from trilat_net.app import RunningSession
+from trilat_net.errors import SessionError, TrilatError, UsageError, count_nouns
 from trilat_net.files import refuse_existing
 from trilat_net.log.ros2 import (
     COMMON_TOPICS,
@@ -50,7 +50,6 @@ from trilat_net.net import (
     Hand,
     Info,
     LinkStats,
-    RouterSilent,
     SessionMembers,
     State,
     SystemClock,
@@ -685,13 +684,13 @@ class _Bridge:
             )
 
         # Subscriptions and services through which ROS programs influence the session.
-        running = RunningSession(session, Connection(), bus)
+        running = RunningSession(session, Connection(), bus, ends.clock)
         self.targets: dict[str, TargetTopic] = {}
         self.dominance: dict[str, DominanceTopic] = {}
         for site in scenario.names:
             self._subscribe_dominance(site, running)
         for site in scenario.open_hands:
-            self._subscribe_target(site)
+            self._subscribe_target(site, running)
         _serve_orders(graph, running, scenario.names)
 
     def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
@@ -718,23 +717,17 @@ class _Bridge:
         self.dominance[topic] = dominance
         ends.graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance.receive)
 
-    def _subscribe_target(self, site: str) -> None:
+    def _subscribe_target(self, site: str, running: RunningSession) -> None:
         """Subscribes to the topic on which a ROS program moves an arm, as its operator.
 
         This lets a person or a program in ROS move an arm of the session.
 
         Args:
             site: Name of the arm's site, whose scenario must allow a live hand.
+            running: Connection through which the targets are sent.
         """
         ends = self._ends
-        hand = open_hand(
-            bus=ends.bus,
-            clock=ends.clock,
-            session=ends.session,
-            site=site,
-            scenario=self._scenario,
-            source="ros2",
-        )
+        hand = running.open_hand(ends.bus, site, self._scenario, "ros2")
 
         frame = self._sites[site].frame
         topic_name, kind, read, apply = _describe_target(self._scenario, site, hand, frame)
@@ -1020,7 +1013,7 @@ def serve_ros2(
         while has_new_epoch and not stopped():
             try:
                 graph = open_graph(Refusals(say))
-            except RouterSilent as silent:
+            except SessionError as silent:
                 if not is_announced:
                     say(f"{silent}: waiting for it; {ROUTER_ADVICE}")
                 is_announced = True

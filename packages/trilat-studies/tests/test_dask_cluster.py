@@ -19,7 +19,7 @@ import trilat_net
 from tests.cli.running import trilat
 from tests.net.waiting import until
 from trilat_net.errors import UsageError
-from trilat_net.files import format_extra_install
+from trilat_net.files import Extra
 from trilat_net.work import dask_cluster
 from trilat_net.work.dask_cluster import WorkerRequirements, describe_worker
 from trilat_net.work.executor import WorkerPool
@@ -236,5 +236,5 @@ def test_a_scheduler_that_does_not_answer_is_named(
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UsageError, match=re.escape(format_extra_install("cluster"))):
+    with pytest.raises(UsageError, match=re.escape(Extra("cluster").install_command)):
         dask_cluster.DaskCluster("tcp://127.0.0.1:1")

@@ -44,13 +44,13 @@ from scipy.optimize import brentq
 
 from trilat_net.analysis import EnvelopeTrend, RestingLoop
 from trilat_net.core import Array
-from trilat_net.errors import UsageError
+from trilat_net.errors import LogError, UsageError
 from trilat_net.execution import FusedRun
 from trilat_net.log import open_log
 from trilat_net.presentation import MARKS, Block, MarkedText, TextTable, describe_moving_states
 from trilat_net.results import Result, finite_or_none
 from trilat_net.scenario import BUILT_IN, Scenario, load_scenario
-from trilat_net.work import Progress, ignore_progress
+from trilat_net.work import Progress
 
 TUNED_LAWS = tuple(
     name
@@ -276,8 +276,12 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
 
     medians_ms = {}
     log = open_log(path)
+    try:
+        link_delays = log.link_delays
+    except LogError as error:
+        raise UsageError(f"--delay {text}: {str(error).removeprefix(f'{path}: ')}") from None
     for name in log.scenario.links:
-        delays = log.link_delays[name]
+        delays = link_delays[name]
         if not delays:
             raise UsageError(f"--delay {text}: no sample arrived over {name}")
         medians_ms[name] = float(np.median([delay_ms for _, delay_ms in delays]))
@@ -766,7 +770,7 @@ def tune_arm(
     poses: int = 16,
     seed: int = 1,
     curve: bool = False,
-    progress: Progress = ignore_progress,
+    progress: Progress | None = None,
 ) -> ArmGains:
     """Finds the largest gains with which identical arms follow one another stably over a delay.
 
@@ -833,7 +837,8 @@ def tune_arm(
     runs = list[dict[str, Any]]()
     steps = 1 + len(laws)
     for run_share, run_law in laws:
-        progress(1 + len(runs), steps)
+        if progress is not None:
+            progress(1 + len(runs), steps)
         run = search.confirm(run_law, run_share, pose, push)
         runs.append(run)
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import options, show_progress, value
+from trilat_net.app import options, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time
 from trilat_net.net import SystemClock
 from trilat_net.presentation import terminal_output as terminal
@@ -476,17 +476,7 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
     if not names_session:
         return text
 
-    from trilat_net.app import ping_session
-
-    measurement = ping_session(
-        connection=reach.resolve(operates=False),
-        clock=SystemClock(),
-        session=options.check_session_name(name),
-        count=50,
-        timeout_s=3.0,
-        stopped=lambda: False,
-    )
-    assert measurement is not None  # nothing stops the measurement
+    measurement = reach.open_session(name, operates=False).ping()
     one_way_us = [
         0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
     ]
@@ -535,7 +525,7 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
         if selected_laws:
             selected_by_form[form] = selected_laws
 
-    with show_progress("tuning", terminal.print_note) as progress:
+    with terminal.show_progress("tuning", terminal.print_note) as progress:
         tune_laws(
             selected_by_form,
             jobs,
@@ -561,7 +551,7 @@ def _run_bench(
     from .bench import run_bench
 
     try:
-        with show_progress("running", terminal.print_note) as progress:
+        with terminal.show_progress("running", terminal.print_note) as progress:
             return run_bench(folder, jobs, on, progress, confirm=confirm)
     except KeyboardInterrupt:
         terminal.print_note(

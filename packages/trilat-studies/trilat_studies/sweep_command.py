@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from trilat_net.app import options, show_progress, value
+from trilat_net.app import options, value
 from trilat_net.errors import UsageError, count_nouns, format_wall_time, join_arguments
 from trilat_net.presentation import terminal_output as terminal
 
@@ -92,7 +92,7 @@ def _draw_map(
     command = results.plan.build_command("--map", *width_option, *beside_option)
     simulated = None if beside is None else read_results(beside)
     terminal.print_text("map: the lines of theory ...")
-    with show_progress(
+    with terminal.show_progress(
         "linear analysis", terminal.print_text, "columns of the map"
     ) as progress:
         stability_map = StabilityMap.of_sweep(
@@ -135,7 +135,7 @@ def _search_margins(
     results_folder = make_results_folder(folder, f"margin-{plan.base.name}", force=None)
     with (
         terminal.lines_aside(as_json),
-        show_progress("searching", terminal.print_text, "places") as progress,
+        terminal.show_progress("searching", terminal.print_text, "places") as progress,
     ):
         margins = SweepMargins.search(
             plan=plan, within=search_range, jobs=jobs, progress=progress, on=on
@@ -228,7 +228,7 @@ def _run_in_folder(
     from .sweep import run_sweep
 
     try:
-        with show_progress("sweeping", terminal.print_text) as progress:
+        with terminal.show_progress("sweeping", terminal.print_text) as progress:
             return run_sweep(
                 folder=folder, jobs=jobs, progress=progress, known=estimate.entries, on=on
             )

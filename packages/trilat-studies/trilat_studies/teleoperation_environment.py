@@ -36,7 +36,7 @@ from msgspec.structs import replace
 from trilat_net.core import POSITION, Array, HandView, SiteArrays, tick_ns
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.execution import FusedRun, record_virtual
-from trilat_net.files import import_extra
+from trilat_net.files import Extra
 from trilat_net.log import expand_poses
 from trilat_net.scenario import (
     HandPlayer,
@@ -56,7 +56,7 @@ try:
     import gymnasium
     from gymnasium import spaces
 except ImportError:
-    import_extra("gymnasium", "gym", "environments")
+    Extra("gym", "environments").import_module("gymnasium")
     raise
 
 ENV_ID = "trilat_net/Teleoperation-v0"

@@ -26,7 +26,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from ...core import Array, Scheme
+from ...core import Array
 from ...log import Log
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer, PeerTrajectory
@@ -291,7 +291,7 @@ class SiteEnergy:
                 dominance=dominance(site, site_records.t_s),
                 peers=peers,
                 torque=TorqueSplit.of_records(site_records, scenario),
-                scheme=Scheme[scenario.scheme.upper()],
+                scheme=scenario.scheme,
                 common=common_axes,
             )
             energies[site] = SiteEnergy(

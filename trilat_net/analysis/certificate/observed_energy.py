@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ...core import Array, LawEnergies, LawRecords, PeerRecords, Scheme, StaleAction
+from ...core import Array, LawEnergies, LawRecords
 from ...hooks import find_hook
 from ...log import Log
 from ...results import JsonObject
@@ -291,8 +291,7 @@ def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
     records = _read_law_records(log, site, law, tick_count)
     declared: LawEnergies = law.energies(records)
     limit_nm = np.array(site_setup.tau_limit_nm)
-    digital = site_setup.scheme is Scheme.DIGITAL
-    held_torque = hold_torque(records.tau, limit_nm, digital=digital)
+    held_torque = hold_torque(records.tau, limit_nm, digital=site_setup.digital)
 
     arm_gave = -records.sum_work(held_torque)
     if site_setup.theta_known:
@@ -358,7 +357,16 @@ def _read_law_records(
         tau_x=site_log.tau_x[:count],
         to_all={key: values for key, values in sent.items() if "[" not in key},
         memory=_read_law_memory(log, site, law, count),
-        peers=[_read_peer_records(log, site, peer, sent, count) for peer in site_log.peers],
+        peers=[
+            LawRecords.select_messages(
+                site=site,
+                peer=peer,
+                tick=site_log.used[peer][:count],
+                sent=sent,
+                sent_by_peer=log[peer].sent,
+            )
+            for peer in site_log.peers
+        ],
     )
 
 
@@ -386,7 +394,7 @@ def _read_law_memory(
     life_length = site_log.layout.count_life_memory(len(site_log.peers), degrades=rule.degrades)
     # the law's memory comes after the memory of the session state or of the reference
     first = site_log.layout.shared + 1
-    if rule.action is StaleAction.GLIDE:
+    if rule.glides:
         first = life_length
 
     attributes = getattr(law, "remembers", ())
@@ -396,45 +404,6 @@ def _read_law_memory(
     parts = np.split(memory, ends[:-1], axis=1)
     # without attributes there is one empty part
     return dict(zip(attributes, parts, strict=False))
-
-
-def _read_peer_records(
-    log: Log,
-    site: str,
-    peer: str,
-    sent: Mapping[str, Array],
-    count: int,
-) -> PeerRecords:
-    """Returns the recorded values that a control law exchanged with one other arm.
-
-    These are the values that the law received from this arm, and the values that it sent to
-    this arm alone. A key such as `wave[s]` is a value for arm s alone.
-
-    Args:
-        log: The log of the run.
-        site: Name of the site of the law.
-        peer: Name of the peer.
-        sent: Values that the law sent.
-        count: Number of records, beginning with the first.
-    """
-    tick = log[site].used[peer][:count]
-    has_sample = tick[:, np.newaxis] >= 0
-    row = np.maximum(tick, 0)
-
-    received = {}
-    for key, values in log[peer].sent.items():
-        name = key.removesuffix(f"[{site}]")
-        # a value for another site
-        if "[" in name:
-            continue
-        received[name] = np.where(has_sample, values[row], 0.0)
-
-    sent_to_peer = {}
-    for key, values in sent.items():
-        if key.endswith(f"[{peer}]"):
-            name = key.partition("[")[0]
-            sent_to_peer[name] = values
-    return PeerRecords(tick, received, sent_to_peer)
 
 
 def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy:

@@ -175,7 +175,7 @@ class RunFacts(NamedTuple):
 
         # the first dominance matrix with several closed groups, for which beta is not unique
         matrices = map(DominanceMatrix, find_dominance_matrices(energies))
-        closed_groups = (matrix.find_closed_groups() for matrix in matrices)
+        closed_groups = (matrix.closed_groups for matrix in matrices)
         ambiguous_groups = next((groups for groups in closed_groups if len(groups) > 1), ())
         group_names = tuple(
             tuple(log.sites[index] for index in group) for group in ambiguous_groups

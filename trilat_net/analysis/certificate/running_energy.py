@@ -353,7 +353,7 @@ class RunningEnergy:
 
         energies = self._derive_energies(tick_spans)
         for alpha in find_dominance_matrices(energies):
-            groups = DominanceMatrix(alpha).find_closed_groups()
+            groups = DominanceMatrix(alpha).closed_groups
             if len(groups) > 1:
                 sites = list(energies)
                 self.closed_groups = [[sites[n] for n in group] for group in groups[:2]]

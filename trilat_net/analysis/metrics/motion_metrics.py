@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core import POSE, POSITION, Array, Law
+from ...core import POSE, POSITION, Array
 from ...log import Log, RotationVectors, compute_task_errors
 from ...results import JsonObject
 from ...scenario import END_WINDOW_S, Scenario
@@ -498,7 +498,7 @@ def _read_parameter_estimates(
     arm = build_arm_rows(scenario, records.site)
     gains = spec.control.gains(arm.theta)
     theta_hat = records.theta_hat
-    if gains.law is Law.ADAPTIVE:
+    if gains.is_adaptive:
         learnt = np.array(gains.Gamma) > 0.0
     else:  # a parameter that changes is learnt
         learnt = (theta_hat != theta_hat[0]).any(axis=0)
@@ -622,7 +622,7 @@ def _measure_parameter_error(view: RunView, site: str) -> MetricValues:
 
     energies: list[float | None] = [None, None]
     why = "the adaptation gains are not known"
-    if gains.law is Law.ADAPTIVE:
+    if gains.is_adaptive:
         energies = _compute_parameter_energy(arm, learnt, np.array(gains.Gamma), errors)
         why = "the number is not finite"
 

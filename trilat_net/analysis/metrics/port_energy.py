@@ -20,7 +20,7 @@ and S_i for each law, and the literature.
 
 import numpy as np
 
-from ...core import Array, Gains, Law, Scheme
+from ...core import Array, Gains
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, DelayedPeer, PeerTrajectory, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows
@@ -88,7 +88,7 @@ def _held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
         tau_right = tau[1:]
         return 0.5 * (tau_left + tau_right)
     tau_limit = np.asarray(spec.limits.tau_limit_nm)
-    digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
+    digital = scenario.scheme == "digital"
     held = hold_torque(tau, tau_limit, digital=digital)
     return held[:-1]
 
@@ -237,7 +237,7 @@ def _measure_delay_energy(view: RunView, link: str) -> MetricValues:
     missing = [name for name in (peer, site) if name not in runs]
     if missing:
         return unavailable(ENERGY, f"no records of {', '.join(missing)}", of="link")
-    if gains.law is Law.USER:
+    if gains.is_user:
         name = view.scenario.sites[site].law_name
         unknown = f"the law {name} does not say which part of its torque is due to a peer"
         return unavailable(ENERGY, unknown, of="link")
@@ -313,7 +313,7 @@ def _compute_delay_torque(
     Lambda = axes * np.array(gains.Lambda)
     Kd = axes * np.array(gains.Kd)
     following = build_following(arm, records.q, records.qd, Lambda).without_posture()
-    if gains.law is Law.ADAPTIVE:
+    if gains.is_adaptive:
         # without gravity the torque is linear in v and a: it is the part due to the shift
         v, a = following.compute_reference(all_rows, -reference_change, -reference_rate_change)
         torque = arm.weightless().law_torque(

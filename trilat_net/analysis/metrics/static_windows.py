@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core import Array, DominanceMatrix, Law, TorqueKind
+from ...core import Array, DominanceMatrix, TorqueKind
 from ...log import Ints
 from ...scenario import Scenario
 from ..aligned import Bools
@@ -564,7 +564,7 @@ def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
         The weights, shape (N, n), or the reason why they are unknown.
     """
     dominance = DominanceMatrix(alpha)
-    if len(dominance.find_closed_groups()) > 1:
+    if len(dominance.closed_groups) > 1:
         return "two groups of sites do not follow each other: it is not unique who feels whom"
     stiffness = []
     for site in scenario.names:
@@ -591,7 +591,7 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     arm = build_arm_rows(scenario, site)
     gains = spec.control.gains(arm.theta)
     unknown = np.zeros(len(spec.q0_rad))
-    if gains.law is Law.USER:
+    if gains.is_user:
         name = spec.law_name
         return unknown, f"the law {name} states no stiffness that holds e at rest"
     if not spec.arm.known:
@@ -599,7 +599,7 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     if np.any(gains.k_f):
         return unknown, "the law reflects force: its torque does not depend on e alone"
 
-    is_adaptive = gains.law is Law.ADAPTIVE
+    is_adaptive = gains.is_adaptive
     has_weight = arm.gravity_parameters
     if is_adaptive and arm.task is not None:
         why = "in task space the stiffness of this law changes with the pose: J+'Kp J+ Lambda"

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ...core import BUCKETS_PER_S, Array, Law, SiteSetup
+from ...core import BUCKETS_PER_S, Array, SiteSetup
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution import FusedRun
 from ...scenario import Scenario
@@ -484,9 +484,9 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
         ScenarioError: The scenario cannot be linearised, or no equilibrium was found.
     """
     sites = OperatingConditions.derive(scenario).sites
-    if any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites):
+    if any(site.gains.is_adaptive or site.actors for site in sites):
         return find_equilibrium(scenario)
-    if all(site.gains.law is Law.KNOWN for site in sites):
+    if all(site.gains.is_known for site in sites):
         return predict_equilibrium(scenario)
     # an imported law need not compensate gravity, so the prediction may fail
     with suppress(ScenarioError):

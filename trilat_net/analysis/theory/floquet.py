@@ -47,7 +47,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from ...core import Array, IntArray, Law, Scheme, SiteSetup
+from ...core import Array, IntArray, SiteSetup
 from ...scenario import LinkBase
 from ..blas_threads import limit_blas_threads
 from ..delay_period import MAX_NEAR_PERIOD_S, DelayPeriod
@@ -124,9 +124,9 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
     rates = jacobian.rates
     joints = layout.joints
     h_s = 1.0 / site.rate_hz
-    is_second_order = site.scheme is Scheme.SECOND_ORDER
+    is_second_order = not site.digital
     # The law `sync` integrates its estimates by the trapezoid rule in either scheme.
-    has_estimates = site.gains.law is Law.ADAPTIVE
+    has_estimates = site.gains.is_adaptive
     uses_trapezoid = has_estimates and (is_second_order or site.gains.absolute)
     motion = slice(0, layout.qd.stop)
     # the same slice of the arguments and of X

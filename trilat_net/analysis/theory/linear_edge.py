@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from ...core import Array, Law, TorqueKind
+from ...core import Array, TorqueKind
 from ...errors import ScenarioError, UsageError
 from ...scenario import Scenario, load_scenario
 from ..blas_threads import limit_blas_threads
@@ -512,7 +512,7 @@ def _assume_equilibrium(
         A remark on the assumption. Empty if none was made.
     """
     sites = OperatingConditions.derive(scenario).sites
-    is_adaptive = any(site.gains.law is Law.ADAPTIVE for site in sites)
+    is_adaptive = any(site.gains.is_adaptive for site in sites)
     has_actors = any(site.actors for site in sites)
     if is_adaptive and not has_actors:
         rest = find_equilibrium(scenario, find_mean_pose(scenario))
@@ -535,5 +535,5 @@ def _find_mean_equilibrium(scenario: Scenario) -> tuple[Equilibrium, str]:
     mean = find_equilibrium(scenario, find_mean_pose(scenario))
     rest = follow_equilibrium(scenario, mean)
     sites = OperatingConditions.derive(scenario).sites
-    is_moved = any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites)
+    is_moved = any(site.gains.is_adaptive or site.actors for site in sites)
     return rest, MEAN_POSE_REMARK if is_moved else ""

@@ -437,8 +437,7 @@ def _end_traces(scenario: Scenario) -> Scenario:
     for name in scenario.links:
         link = scenario.find_final_link(name)
         points = link.points
-        has_ending_trace = link.to_core_model().has_ending_trace
-        if has_ending_trace and points is not None and points[-1, 0] <= end_us:
+        if link.has_ending_trace and points is not None and points[-1, 0] <= end_us:
             last_delays_ms[name] = 1e-3 * float(points[-1, 1])
     return scenario.with_constant_delays(last_delays_ms)
 
@@ -452,8 +451,7 @@ def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
     has_unknown_delay = {}
     for name in scenario.links:
         link = scenario.find_final_link(name)
-        has_ending_trace = link.to_core_model().has_ending_trace
-        has_unknown_delay[name] = link.random or link.measured or has_ending_trace
+        has_unknown_delay[name] = link.random or link.measured or link.has_ending_trace
     return has_unknown_delay
 
 

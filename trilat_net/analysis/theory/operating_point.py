@@ -27,18 +27,15 @@ from ...core import (
     OWN_KINDS,
     SCRIPTED_KINDS,
     Array,
-    DelayKind,
     Gains,
-    Scheme,
     SiteSetup,
-    StaleAction,
     TorqueKind,
     TorqueSource,
     link_key,
 )
 from ...errors import ScenarioError, count_nouns
 from ...files import find_page
-from ...laws import LinearForm, LinearSituation
+from ...laws import LinearForm
 from ...records import NS_PER_S
 from ...scenario import LinkBase, Scenario
 from ..delay_period import (
@@ -144,18 +141,8 @@ class OperatingConditions(NamedTuple):
             The equations for each site, or `None` for a site whose law is fully described by
             its gains.
         """
-        forms: list[LinearForm | None] = []
-        for n, law in enumerate(self.laws):
-            M = inertia[n] if inertia else np.eye(self.sites[n].layout.joints)
-            situation = LinearSituation(
-                site=n,
-                names=self.names,
-                laws=self.laws,
-                alpha=self.alpha,
-                inertia=M,
-            )
-            forms.append(law.linear_form(situation))
-        return forms
+        inertia = inertia or [np.eye(site.layout.joints) for site in self.sites]
+        return LinearForm.list_forms(self.names, self.laws, self.alpha, inertia)
 
     @property
     def coupled_pairs(self) -> list[tuple[int, int]]:
@@ -201,7 +188,7 @@ class OperatingConditions(NamedTuple):
         has_random_link = any(link.random for link, _ in self.links.values())
         if self.varying and not has_random_link:
             return True
-        if self.sites[0].scheme is Scheme.DIGITAL:
+        if self.sites[0].digital:
             return True
         actors = [actor for site in self.sites for actor in site.actors]
         return any(actor.sampled for actor in actors)
@@ -377,7 +364,7 @@ class OperatingConditions(NamedTuple):
                 f"{least_ms:.4g} to {most_ms:.4g} ms: the continuous loop is linearised at the "
                 "mean of each, and leaves out the effect of the variation itself"
             )
-        if any(site.on_stale.action is not StaleAction.USE for site in sites):
+        if any(site.on_stale.is_active for site in sites):
             notes.append("rules for stale peers are left out: no peer counts as stale")
         return conditions._replace(
             notes=tuple(dict.fromkeys(notes)), varying=bool(varying), links=links
@@ -412,8 +399,7 @@ def _is_constant_link(link: LinkBase) -> bool:
     Args:
         link: Delay model of the link, from the scenario.
     """
-    has_constant_model = link.to_core_model().kind == DelayKind.CONSTANT
-    return has_constant_model and not link.loss and not link.measured
+    return link.constant_delay_ms is not None and not link.loss
 
 
 def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
@@ -608,7 +594,7 @@ def has_lasting_delays(scenario: Scenario) -> bool:
         link = scenario.find_final_link(f"{peer}->{site}")
 
         table = link.points
-        if link.to_core_model().has_ending_trace and table is not None:
+        if link.has_ending_trace and table is not None:
             if table[-1, 0] > 1e6 * scenario.duration_s:
                 return False
             continue

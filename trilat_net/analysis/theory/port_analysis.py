@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
 
-from ...core import POSITION, Array, Law, SiteSetup, TorqueKind, TorqueSource
+from ...core import POSITION, Array, SiteSetup, TorqueKind, TorqueSource
 from ...errors import UsageError, count_nouns
 from ...results import finite_or_none
 from ...scenario import TASK_AXES, Scenario
@@ -112,7 +112,7 @@ def build_proof_output(
             orientations, and for axes that a peer does not follow.
     """
     sites = conditions.sites
-    if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in sites):
+    if any(not site.gains.is_adaptive or site.gains.absolute for site in sites):
         return None
     if sites[0].layout.task and sites[0].layout.shared > POSITION:
         return None
@@ -414,7 +414,7 @@ class PortAnalysis(NamedTuple):
 def _are_estimates_true(conditions: OperatingConditions, rest: Equilibrium) -> bool:
     """Returns True if every estimate at the equilibrium is the true parameter."""
     for theta_hat, site in zip(rest.theta_hat, conditions.sites, strict=True):
-        if site.gains.law is Law.USER:
+        if site.gains.is_user:
             continue
         if not np.allclose(theta_hat[: len(site.theta)], site.theta):
             return False

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import SCRIPTED_KINDS, Array, Law, SiteSetup, TorqueKind, TorqueSource
+from ...core import SCRIPTED_KINDS, Array, SiteSetup, TorqueKind, TorqueSource
 from ..arm_rows import Numbers, PlacedArm, multiply_columns
 from .numeric_law import NumericLaw
 from .textbook_arm import Following, PlacedChain, share_pose
@@ -326,7 +326,7 @@ def has_estimate(site: SiteSetup) -> bool:
     """
     if isinstance(site.law_factory, NumericLaw):
         return len(site.law_factory.memory) > 0
-    return site.gains.law is Law.ADAPTIVE
+    return site.gains.is_adaptive
 
 
 def _as_columns(values: object, like: Numbers) -> Numbers:
@@ -572,7 +572,7 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
                 "it counts as not touching"
             )
 
-    if site.gains.law is not Law.ADAPTIVE:
+    if not site.gains.is_adaptive:
         return
     for p in np.flatnonzero(_find_switching_estimates(site, x)):
         yield (

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core import BUCKETS_PER_S, Array, DelayKind
+from ...core import BUCKETS_PER_S, Array
 from ...errors import NotRepeatable, UsageError
 from ...execution import (
     LEAST_PUSH,
@@ -483,7 +483,7 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
     is `None` if all delays are constant, or if some delay never repeats.
     """
     links = [scenario.find_final_link(name) for name in scenario.links]
-    if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
+    if all(link.constant_delay_ms is not None for link in links):
         return None
     return DelayPeriod.of_scenario(scenario).true_s
 

@@ -27,15 +27,13 @@ from typer.core import TyperCommand, TyperGroup
 
 from ...entry_points import COMMANDS, find_entries, find_package, load_entry
 from ...errors import LogRefused, TrilatError, UsageError, find_nearest, join_arguments
-from ...files import (
-    DISK_ERRNOS,
+from ...files import DISK_ERRNOS, find_version
+from ...package_names import (
     EXTRAS,
+    PACKAGE_COMMANDS,
     STUDY_LIBRARIES,
     describe_missing_library,
-    find_version,
-    require_libraries,
 )
-from ...package_names import PACKAGE_COMMANDS
 from ...presentation import err, print_error, print_line
 from ...signals import Interrupt
 from . import sessions
@@ -526,9 +524,7 @@ def _run() -> None:
         app()
     except ModuleNotFoundError as error:
         missing_library = (error.name or "").partition(".")[0]
-        if missing_library in STUDY_LIBRARIES:
-            require_libraries(missing_library)  # raises the error that names the remedy
-        if missing_library in EXTRAS:
+        if missing_library in STUDY_LIBRARIES or missing_library in EXTRAS:
             problem = describe_missing_library("this command", error)
             raise UsageError(problem) from None
         raise

@@ -384,7 +384,7 @@ def keys_info_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Shows whose keys these are, when and where they are valid, and what they permit."""
-    from ...net import ROLES, ROUTER, describe_role, read_member_keys
+    from ...net import ROLES, ROUTER, read_member_keys
 
     if rules and as_json:
         raise UsageError("--rules and --json cannot be combined: --json contains the rules")
@@ -413,8 +413,50 @@ def keys_info_command(
             f"{folder}: keys of {kind_prefix}{keys.member}, for a session with {others_text}",
             f"valid until {keys.ends:%Y-%m-%d %H:%M} UTC, {days_text} from now",
             f"others may reach it at: {', '.join(keys.hosts)}",
-            *describe_role(keys.member),
+            *_describe_role(keys.member),
             f"all rules: trilat keys info {shlex.quote(str(folder))} --rules",
         ]
     )
     return None
+
+
+def _describe_role(member: str) -> list[str]:
+    """Describes what a member with keys may send, with one line per kind of receiver.
+
+    Replies, queries for information and liveliness tokens are left out, because every member
+    may send them.
+
+    Args:
+        member: Name of the member, which determines its role.
+    """
+    from ...net import ROLES, ROUTER, SITE_ROLE, topics
+
+    if member == ROUTER:
+        return ["forwards the messages of all members, whatever they contain"]
+    channel_words = {
+        topics.SAMPLE: "samples",
+        topics.STATE: "records",
+        topics.LINK: "statistics of its loop and links",
+        topics.EVENT: "events",
+        topics.MEASURED: "measurements of an external arm",
+        topics.VIEW: "views for an operator's program",
+        topics.STATS: "statistics of the recording",
+        topics.HAND: "live hands",
+        topics.ENABLE: "reports of a dead-man switch",
+        topics.SET: "all orders, such as set, enable and reset",
+        topics.STOP: "the order to stop",
+    }
+    permissions = ROLES.get(member, SITE_ROLE)
+    request_channels = [
+        channel for channel in permissions.queries if channel in (topics.SET, topics.STOP)
+    ]
+    to_others = [
+        channel_words[channel] for channel in (*permissions.publishes_to, *request_channels)
+    ]
+    descriptions = []
+    if permissions.publishes:
+        published = [channel_words[channel] for channel in permissions.publishes]
+        descriptions.append(f"may send in its own name: {', '.join(published)}")
+    if to_others:
+        descriptions.append(f"may send to every site: {', '.join(to_others)}")
+    return descriptions

@@ -298,14 +298,12 @@ def _open_page(files: list[Path]) -> None:
     import webbrowser
     from contextlib import suppress
 
-    from ...files import format_extra_install, make_results_folder, refuse_link
+    from ...files import Extra, make_results_folder, refuse_link
     from ...presentation import conclude
     from ..api import choose_report_folder
 
-    terminal.print_note(
-        f"Rerun is not installed ({format_extra_install('view')}); "
-        "the log's page is shown instead"
-    )
+    command = Extra("view").install_command
+    terminal.print_note(f"Rerun is not installed ({command}); the log's page is shown instead")
 
     folder = choose_report_folder(files[0])
     refuse_link(folder)

@@ -176,11 +176,11 @@ def record_command(
         durable: Sync to the disk at every flush instead of every second.
     """
     from recorder import record_session
-    from sites import check_machine_load
 
     from ...files import refuse_existing
     from ...log import ChannelFilter, LogStorage, collect_provenance
     from ...net import RECORDER
+    from ..machine_load import check_machine_load
     from ..recorded_session import make_scenario_reader
     from .options import parse_viz_rate
 
@@ -256,7 +256,8 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
         session: Name of the session.
         concluded: True if a report is written into the folder of the log.
     """
-    from ...files import make_folder, make_results_folder, require_libraries
+    from ...files import make_folder, make_results_folder
+    from ...package_names import require_libraries
 
     if not concluded:
         return output if output is not None else Path(f"{session}.mcap")

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ...net import Connection
     from ...results import Result
     from ...scenario import Scenario
+    from ..running_session import RunningSession
 
 Runs = TypeVar("Runs", bound=Callable[..., None])
 
@@ -644,6 +645,24 @@ class Reach(NamedTuple):
 
         connection = MemberOptions(None, *self).resolve(stops=stops)
         return connection.require(OPERATOR) if operates else connection
+
+    def open_session(
+        self, name: str, *, operates: bool = True, stops: bool = False
+    ) -> "RunningSession":
+        """Prepares the connection over which a command sends requests to a running session.
+
+        Args:
+            name: Name of the session.
+            operates: True if the command's requests require the operator's keys.
+            stops: True if the command only stops arms. Expired keys are then also accepted.
+
+        Raises:
+            UsageError: The name has characters that are not allowed, or the keys are rejected.
+        """
+        from ..running_session import RunningSession
+
+        connection = self.resolve(operates=operates, stops=stops)
+        return RunningSession(check_session_name(name), connection)
 
 
 class LawFileOptions(NamedTuple):

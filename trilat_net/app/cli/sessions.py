@@ -22,8 +22,6 @@ from . import options
 from .options import flag, value
 
 if TYPE_CHECKING:
-    from trilat_net.app.running_session import RunningSession
-
     from ...scenario import Scenario
 
 
@@ -96,7 +94,8 @@ def run_and_report(
     """
     from trilat_net.app.demo_session import run_demo
 
-    from ...files import make_results_folder, require_libraries
+    from ...files import make_results_folder
+    from ...package_names import require_libraries
 
     require_libraries()
     results = make_results_folder(run.folder, chosen.name, force=run.force)
@@ -394,22 +393,6 @@ SitesArgument = Annotated[
 ]
 
 
-def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
-    """Prepares the connection over which a command sends requests to a running session.
-
-    `trilat stop` and `trilat set` are such commands.
-
-    Args:
-        session: Name of the session.
-        reach: The options by which the command reaches the session.
-        stops: True if the command only stops arms. Expired keys are then accepted.
-    """
-    from trilat_net.app.running_session import RunningSession
-
-    connection = reach.resolve(operates=False, stops=stops)
-    return RunningSession(options.check_session_name(session), connection)
-
-
 @options.command(
     "--session paper s", "--session paper --end", page="docs/sessions/live-page.md"
 )
@@ -432,7 +415,7 @@ def stop_command(
     """
     if end and sites:
         raise UsageError("--end ends the whole session: do not name a site")
-    running = _connect(session, reach, stops=not end)
+    running = reach.open_session(session, operates=False, stops=not end)
     replies = running.end() if end else running.stop(*(sites or ()))
     terminal.print_texts(replies)
 
@@ -445,7 +428,8 @@ def enable_command(
 
     Each arm first waits for the other arms and aligns with them.
     """
-    terminal.print_texts(_connect(session, reach).enable(*(sites or ())))
+    running = reach.open_session(session, operates=False)
+    terminal.print_texts(running.enable(*(sites or ())))
 
 
 @options.command("--session paper s", page="docs/sessions/external-arm.md")
@@ -462,7 +446,8 @@ def reset_command(
     The sites then wait for the other sites. Each arm aligns with the other arms before
     following them.
     """
-    terminal.print_texts(_connect(session, reach).reset(*sites))
+    running = reach.open_session(session, operates=False)
+    terminal.print_texts(running.reset(*sites))
 
 
 _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from .chain import Matrix, Three, multiply_matrices, multiply_vector
 from .elementary import sincos
+from .rotation import rotation_matrix
 
 _plain_sincos = getattr(sincos, "py_func", sincos)
 """Uncompiled version of `sincos`, because compiling takes longer than reading an arm file."""
@@ -42,6 +43,15 @@ class FramePose(NamedTuple):
             (-sp, cp * sr, cp * cr),
         )
         return cls(rotation, origin_m)
+
+    @classmethod
+    def from_rotation_vector(cls, vector_rad: Three) -> "FramePose":
+        """Returns the pose with the rotation of a rotation vector, and no translation.
+
+        Args:
+            vector_rad: Axis of the rotation times its angle, rad.
+        """
+        return cls(rotation_matrix(vector_rad))
 
     def __matmul__(self, inner: "FramePose") -> "FramePose":
         """Returns the composition of two poses.

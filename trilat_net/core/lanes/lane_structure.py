@@ -21,7 +21,7 @@ from .lane_laws import LaneLaw
 from .lane_rows import Constants
 
 SITE_CONSTANTS: tuple[str, ...] = (
-    *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "theta_known"),
+    *("rate_hz", "first", "digital", "law", "external", "ramps", "on_stale", "theta_known"),
     *("needs_model", "remembered", "asked", "order", "skipped", "degrades", "regrouped"),
     *("holds", "joints", "shared", "parameters", "task", "sent", "reason"),
 )

@@ -15,11 +15,11 @@ Invariant (law L4 of docs/develop/design.md):
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..plug.plugged import call_address
+from ..plug.plugged import UserModel, call_address
 from ..step.jit import leaf
 from ..step.row_fields import LinkRow
 from ..step.vectors import Points, Row, count_started
@@ -61,6 +61,15 @@ class DelayKind(IntEnum):
     TRACE = 8
     MEASURED = 9
     CUSTOM = 10
+
+
+_DETERMINISTIC_KINDS = (
+    DelayKind.CONSTANT,
+    DelayKind.SINE,
+    DelayKind.TRACE,
+    DelayKind.MEASURED,
+)
+"""Delay kinds that are not random."""
 
 
 class TraceEnd(IntEnum):
@@ -123,6 +132,126 @@ class LinkModel(NamedTuple):
     drawn_us: float = 0.0
 
     @classmethod
+    def constant(cls, delay_us: float) -> "LinkModel":
+        """Creates a model with the same delay for every sample, us."""
+        return cls(kind=DelayKind.CONSTANT, location=delay_us)
+
+    @classmethod
+    def uniform(cls, mean_us: float, half_width_us: float) -> "LinkModel":
+        """Creates a model with delays drawn uniformly from mean +- half width, us."""
+        return cls(kind=DelayKind.UNIFORM, location=mean_us, scale=half_width_us)
+
+    @classmethod
+    def normal(cls, mean_us: float, deviation_us: float) -> "LinkModel":
+        """Creates a model with normally distributed delays, us; negative draws are repeated."""
+        return cls(kind=DelayKind.NORMAL, location=mean_us, scale=deviation_us)
+
+    @classmethod
+    def correlated(cls, mean_us: float, deviation_us: float, correlation: float) -> "LinkModel":
+        """Creates a model with normally distributed delays that vary slowly.
+
+        Args:
+            mean_us: Mean, us, before negative delays are set to zero.
+            deviation_us: Standard deviation, us.
+            correlation: Correlation between the delays of successive samples.
+        """
+        return cls(kind=DelayKind.AR1, location=mean_us, scale=deviation_us, weight=correlation)
+
+    @classmethod
+    def gamma(cls, shape: float, scale_us: float) -> "LinkModel":
+        """Creates a model with gamma-distributed delays, with the scale in us."""
+        return cls(kind=DelayKind.GAMMA, extra=shape, scale=scale_us)
+
+    @classmethod
+    def log_normal(cls, mean: float, deviation: float) -> "LinkModel":
+        """Creates a model with log-normally distributed delays.
+
+        Args:
+            mean: Mean of the logarithm of the delay in us.
+            deviation: Standard deviation of that logarithm.
+        """
+        return cls(kind=DelayKind.LOG_NORMAL, location=mean, scale=deviation)
+
+    @classmethod
+    def hyper_exponential(
+        cls, floor_us: float, fast_us: float, slow_us: float, slow_share: float
+    ) -> "LinkModel":
+        """Creates a model whose delays are the sum of a fixed and an exponential part.
+
+        Args:
+            floor_us: Fixed part, us.
+            fast_us: Mean of the frequent exponential part, us.
+            slow_us: Mean of the rare exponential part, us.
+            slow_share: Probability of the rare part.
+        """
+        return cls(
+            kind=DelayKind.HYPER_EXPONENTIAL,
+            location=floor_us,
+            scale=fast_us,
+            extra=slow_us,
+            weight=slow_share,
+        )
+
+    @classmethod
+    def sine(
+        cls, mean_us: float, amplitude_us: float, period_us: float, phase_rad: float
+    ) -> "LinkModel":
+        """Creates a model whose delay varies sinusoidally with the time of sending.
+
+        Args:
+            mean_us: Mean, us.
+            amplitude_us: Amplitude, us.
+            period_us: Period, us.
+            phase_rad: Phase at the start of the session, rad.
+        """
+        return cls(
+            kind=DelayKind.SINE,
+            location=mean_us,
+            scale=amplitude_us,
+            extra=period_us,
+            weight=phase_rad,
+        )
+
+    @classmethod
+    def measured(cls) -> "LinkModel":
+        """Creates a model that adds no delay to that of the real network."""
+        return cls(kind=DelayKind.MEASURED)
+
+    @classmethod
+    def custom(cls, longest_us: float) -> "LinkModel":
+        """Creates a model whose delays come from a compiled function, see `draw_with`.
+
+        Args:
+            longest_us: Longest delay, us.
+        """
+        return cls(kind=DelayKind.CUSTOM, location=longest_us)
+
+    def draw_with(self, model: Any) -> "LinkModel":
+        """Returns this model with delays computed by the method `draw` of a class.
+
+        The method is compiled.
+
+        Args:
+            model: An instance of the class. Its fields are the numeric settings of the delay.
+        """
+        address = UserModel(model).compile_to_address("draw", LINK_MODEL_DTYPE)
+        return self._replace(call=address)
+
+    @staticmethod
+    def pack_settings(model: Any) -> Points:
+        """Returns the numeric settings of a delay model in the form of a recorded trace.
+
+        A link has one integer table, which normally holds a recorded delay trace. The bit
+        patterns of the floating-point settings are stored in this table, two per row.
+
+        Args:
+            model: The delay model, see `draw_with`.
+        """
+        numbers = UserModel(model).numbers
+        rows = math.ceil(max(len(numbers), 1) / 2)
+        return np.resize(numbers, (rows, 2)).view(np.int64)
+
+    @classmethod
     def follow_trace(cls, at_end: str) -> "LinkModel":
         """Creates a model that takes its delays from a recorded trace.
 
@@ -133,9 +262,24 @@ class LinkModel(NamedTuple):
         return cls(kind=DelayKind.TRACE, at_end=TraceEnd[at_end.upper()])
 
     @property
-    def has_ending_trace(self) -> bool:
-        """True if the delays follow a trace that does not start again at its end."""
-        return self.kind == DelayKind.TRACE and self.at_end == TraceEnd.HOLD
+    def is_random(self) -> bool:
+        """True if delays are drawn at random. Losses and duplicates do not count."""
+        return self.kind not in _DETERMINISTIC_KINDS
+
+    @property
+    def is_measured(self) -> bool:
+        """True if the only delay is that of the real network."""
+        return self.kind == DelayKind.MEASURED
+
+    @property
+    def least_us(self) -> float:
+        """Shortest time for which a sample is held back, us.
+
+        A random delay may be as short as 0, but the play-out buffer holds each sample until it
+        has at least a given age.
+        """
+        is_constant = self.kind == DelayKind.CONSTANT
+        return max(self.playout_us, self.location if is_constant else 0.0)
 
 
 LINK_MODEL_DTYPE = np.dtype(

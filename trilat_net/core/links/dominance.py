@@ -21,6 +21,8 @@ of Upsilon, and is a left null vector only if the columns also sum to 1. The lef
 an irreducible matrix is its Perron vector, which is positive and unique up to scaling.
 """
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,17 +47,34 @@ class DominanceMatrix:
 
     Attributes:
         alpha: The dominance factors passed to the constructor.
-        reach: Boolean array of shape (N, N), True at [i, j] if i = j, or if site i follows site
-            j directly or through other sites.
     """
+
+    @classmethod
+    def complementary(cls, a: float) -> "DominanceMatrix":
+        """Computes all dominance factors of two users and a slave from the single factor a.
+
+        The slave follows user 1 with the weight a and user 2 with 1 - a. User 1 follows user 2
+        with 1 - a and the slave with a. User 2 follows user 1 with a and the slave with 1 - a.
+
+        Args:
+            a: Authority of user 1, from 0 to 1. User 2 has 1 - a.
+
+        Returns:
+            The matrix, in the order user 1, user 2, slave.
+        """
+        user_1 = (0.0, 1.0 - a, a)
+        user_2 = (a, 0.0, 1.0 - a)
+        slave = (a, 1.0 - a, 0.0)
+        return cls(np.array([user_1, user_2, slave]))
 
     def __init__(self, alpha: Array) -> None:
         self.alpha = alpha
+        # True at [i, j] if i = j, or if site i follows site j directly or through other sites.
         reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
         # Each squaring doubles the length of the paths.
         for _ in range(len(alpha).bit_length()):
             reach = reach @ reach
-        self.reach = reach
+        self._reach = reach
 
     @property
     def is_irreducible(self) -> bool:
@@ -63,18 +82,16 @@ class DominanceMatrix:
 
         The stability theorem requires this property.
         """
-        return bool(self.reach.all())
+        return bool(self._reach.all())
 
-    def find_closed_groups(self) -> tuple[tuple[int, ...], ...]:
-        """Finds groups of sites that follow each other, but no site outside their group.
+    @cached_property
+    def closed_groups(self) -> tuple[tuple[int, ...], ...]:
+        """Groups of sites that follow each other, but no site outside their group.
 
-        If there are several groups, the weights of the sites in the energy function V are not
-        unique.
-
-        Returns:
-            Indices of the sites in each group.
+        Each group is a tuple of the indices of its sites. If there are several groups, the
+        weights of the sites in the energy function V are not unique.
         """
-        reach = self.reach
+        reach = self._reach
         groups = []
         for site in range(len(reach)):
             is_mutual = reach[site] & reach[:, site]
@@ -100,7 +117,7 @@ class DominanceMatrix:
             D, shape (N,), with D = 1 at the first site of each group. None if no D exists.
         """
         alpha = self.alpha
-        is_on_circle = self.reach & self.reach.T & (alpha > 0.0)
+        is_on_circle = self._reach & self._reach.T & (alpha > 0.0)
         D = np.zeros(len(alpha))  # 0: not known yet
         for first in range(len(alpha)):
             if D[first]:
@@ -171,7 +188,7 @@ class DominanceMatrix:
         """Returns the left eigenvector pi for the eigenvalue 1, even of a reducible matrix.
 
         The vector satisfies pi >= 0 and pi' alpha = pi', and its entries sum to 1. pi is 0 for
-        sites outside closed groups, see `find_closed_groups`. With several closed groups, pi is
+        sites outside closed groups, see `closed_groups`. With several closed groups, pi is
         not unique; the sum of its entries in each group is then chosen proportional to the
         number of sites in the group.
 
@@ -179,7 +196,7 @@ class DominanceMatrix:
             The vector, shape (N,).
         """
         pi = np.zeros(len(self.alpha))
-        groups = self.find_closed_groups()
+        groups = self.closed_groups
         total = sum(map(len, groups))
         for group in groups:
             group_pi = DominanceMatrix(self.alpha[np.ix_(group, group)]).find_beta()

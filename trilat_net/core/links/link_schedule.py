@@ -10,12 +10,13 @@ Invariant:
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...records import NS_PER_S
 from ..step.site_setup import LinkSetup
 from ..step.vectors import IntArray, Row
 from .channel import LOST, schedule_deliveries
-from .delay import LINK_MODEL_DTYPE, LinkModel
+from .delay import LINK_MODEL_DTYPE, DelayKind, LinkModel
 from .link import link_dtype
 
 _BLOCK = 8192
@@ -91,6 +92,19 @@ class LinkSchedule:
             positions = np.arange(start, stop) % _BLOCK
             due_ns[start - first : stop - first] = self._block[positions]
         return due_ns
+
+    def find_measured(self, stamp_ns: IntArray) -> NDArray[np.bool_]:
+        """Marks the messages whose only delay is that of the real network.
+
+        Args:
+            stamp_ns: Sending times of the messages, ns since the epoch, shape (M,).
+
+        Returns:
+            One truth value per message, shape (M,).
+        """
+        model_index = np.searchsorted(self.models["from_ns"][1:], stamp_ns, side="right")
+        is_measured: NDArray[np.bool_] = self.models["kind"][model_index] == DelayKind.MEASURED
+        return is_measured
 
     def draw_releases(self, end: int, receiver_hz: int) -> tuple[IntArray, IntArray]:
         """Computes when the next messages of the link are first used by the receiver.

@@ -12,14 +12,17 @@ Invariant:
       peers, ordered by peer as in the scenario.
 """
 
+import keyword
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from ...errors import count_nouns
+import numpy as np
+
+from ...errors import ScenarioError, count_nouns
 
 MAX_SENT = 16
 """Largest number of values per joint that a law sends to a peer."""
-MAX_RECORD_SENT = 1024
+_MAX_RECORD_SENT = 1024
 """Largest number of values that a law sends to all its peers in one tick, as stored in a
 record.
 """
@@ -187,6 +190,44 @@ class LawChannel(NamedTuple):
         start = to_all + peer_index * to_each
         return [*sent[:to_all], *sent[start : start + to_each]]
 
+    def check_vectors(self, joints: int, path: str) -> None:
+        """Raises ScenarioError if the vectors have invalid names or are too long.
+
+        The vectors are part of each network message between arms, and a long message would take
+        too much time.
+
+        Args:
+            joints: Number of joints of the site's arm.
+            path: Path of the law's settings in the scenario file, for error messages.
+
+        Raises:
+            ScenarioError: A name is not allowed, or the vectors have more entries than a
+                message or a log entry can hold.
+        """
+        sends_path = f"{path}.sends"
+        for vector in self.vectors:
+            problem = _find_name_problem(vector.name)
+            if problem:
+                raise ScenarioError(problem, path=f"{sends_path}.{vector.name}")
+
+        largest_count = MAX_SENT * joints
+        if self.received_size > largest_count:
+            count = count_nouns(self.received_size, "number")
+            problem = (
+                f"sends {count} to each peer, but a law may send at most {largest_count}, "
+                f"{MAX_SENT} per joint"
+            )
+            raise ScenarioError(problem, path=sends_path)
+
+        if self.record_size > _MAX_RECORD_SENT:
+            count = count_nouns(self.record_size, "number")
+            receivers = count_nouns(self.peers, "peer")
+            problem = (
+                f"sends {count} to {receivers} together, but a record holds at most "
+                f"{_MAX_RECORD_SENT}"
+            )
+            raise ScenarioError(problem, path=sends_path)
+
     @staticmethod
     def join_received(channels: "Sequence[LawChannel]") -> tuple[SentVector, ...]:
         """Returns all vectors that the control law of an arm may receive from the other laws.
@@ -208,3 +249,28 @@ class LawChannel(NamedTuple):
                     problem = f"peers send {vector.name} with different lengths"
                     raise ValueError(f"{problem}, {first.length} and {count}")
         return tuple(by_name.values())
+
+
+def _find_name_problem(name: str) -> str:
+    """Returns the reason why a name is unsuitable for a vector.
+
+    A law reads the vector as an attribute of its input, so the name must be an identifier, and
+    must not be an existing attribute of the input.
+
+    Returns:
+        The reason. Empty if the name is suitable.
+    """
+    is_identifier = name.isidentifier() and not keyword.iskeyword(name)
+    is_public = not name.startswith("_") and len(name) <= 24
+    if not (is_identifier and is_public):
+        return (
+            "is not a valid name for a vector: the name must start with a letter, contain only "
+            "letters, digits and _, have at most 24 characters, and not be a Python keyword"
+        )
+    is_record_attribute = hasattr(np.record, name)
+    if is_record_attribute or hasattr(tuple, name):
+        return (
+            "is reserved, because every record of numbers has an attribute of that name: "
+            "choose another name"
+        )
+    return ""

@@ -65,6 +65,43 @@ class LawRecords(NamedTuple):
     memory: Mapping[str, Array]
     peers: Sequence[PeerRecords]
 
+    @staticmethod
+    def select_messages(
+        site: str,
+        peer: str,
+        tick: IntArray,
+        sent: Mapping[str, Array],
+        sent_by_peer: Mapping[str, Array],
+    ) -> PeerRecords:
+        """Selects the values that the law of a site exchanged with one peer in K ticks.
+
+        The key of a vector sent to all peers is its name. The key of a vector for a single peer
+        also contains this peer, for example "wave[s]".
+
+        Args:
+            site: Name of the site.
+            peer: Name of the peer.
+            tick: Tick of the sample in use from the peer, shape (K,). -1 for none.
+            sent: All vectors sent by the site, by key, shape (K, length).
+            sent_by_peer: All vectors sent by the peer, by key, one row per tick of the peer.
+        """
+        has_sample = tick[:, np.newaxis] >= 0
+        row = np.maximum(tick, 0)
+
+        received = {}
+        for key, values in sent_by_peer.items():
+            name = key.removesuffix(f"[{site}]")
+            is_for_another_site = "[" in name
+            if not is_for_another_site:
+                received[name] = np.where(has_sample, values[row], 0.0)
+
+        sent_to_peer = {}
+        for key, values in sent.items():
+            if key.endswith(f"[{peer}]"):
+                name = key.partition("[")[0]
+                sent_to_peer[name] = values
+        return PeerRecords(tick, received, sent_to_peer)
+
     def sum_work(self, tau: Array) -> Array:
         """Returns the work done by a joint torque since the start of the run, at each tick.
 

@@ -19,7 +19,7 @@ from ..arms.exogenous import TorqueKind, TorqueSource
 from ..arms.two_link_arm import PARAMETERS, ArmLinks
 from ..links.delay import DelayKind, LinkModel
 from .jit import leaf
-from .site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup
+from .site_setup import Gains, Law, LinkSetup, SiteSetup
 from .site_step import Site
 from .ticks import Arrival, TickInput
 from .vectors import Array
@@ -67,7 +67,7 @@ def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
     return SiteSetup(
         name=name,
         rate_hz=1000,
-        scheme=Scheme.SECOND_ORDER,
+        digital=False,
         gains=Gains(
             Law.ADAPTIVE,
             Lambda=(1.0, 1.3),

@@ -37,7 +37,7 @@ from . import control
 from .jit import leaf
 from .row_fields import ArrivalRow, SiteRow
 from .site_arrays import SiteArrays, TickBuffers
-from .site_setup import Law, Scheme, StaleAction
+from .site_setup import Law, StaleAction
 from .ticks import LifeReason, Mode, tick_ns
 from .vectors import Array, IntArray, Points, RowArray, Vector
 
@@ -45,7 +45,6 @@ _DIVERGED = int(Mode.DIVERGED)
 _FAULT = int(Mode.FAULT)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
-_DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE = int(Law.ADAPTIVE)
 _USER = int(Law.USER)
 
@@ -152,7 +151,7 @@ def updates_estimate(k: int, s: SiteRow) -> bool:
     integrates at the end of the period. Whether the mode allows adaptation is decided by
     `adapts`.
     """
-    return bool(s.scheme != _DIGITAL and k != s.first and s.law == _ADAPTIVE)
+    return bool(not s.digital and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
@@ -361,7 +360,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
         return
     for i in range(s.u.shape[0]):
         torque = s.tau[i]
-        if s.scheme != _DIGITAL and k > s.first:
+        if not s.digital and k > s.first:
             extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
             torque = control.limit_torque(extrapolated, s.tau_limit[i])
         s.u[i] = torque + s.held[i]
@@ -380,7 +379,7 @@ def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> Non
         is_adapting: Result of `adapts` before the arm moved.
     """
     h_s = 1.0 / s.rate_hz
-    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and is_adapting and s.mode != _DIVERGED:
+    if s.digital and s.law == _ADAPTIVE and is_adapting and s.mode != _DIVERGED:
         _advance_estimate(s, chain, h_s, s.Yr)
     for i in range(s.tau.shape[0]):
         s.tau_before[i] = s.tau[i]

@@ -58,7 +58,7 @@ class SiteRow(Protocol):
 
     rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]
     first: Annotated[int, Field("", "tick", "first tick that the site computes", "setup")]
-    scheme: Annotated[int, Field("", "Scheme", "how the law is sampled", "setup")]
+    digital: Annotated[int, Field("", "", "1: the law is sampled with a hold", "setup")]
     law: Annotated[int, Field("", "Law", "control law", "setup")]
     external: Annotated[int, Field("", "", "1: the arm is measured, not integrated", "setup")]
     ramps: Annotated[int, Field("", "", "filled rows of `SiteArrays.ramps`", "input")]

@@ -37,7 +37,7 @@ from ..links.link import (
     span_ticks,
 )
 from .row_fields import FIELDS, field_shape, row_dtype
-from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
+from .site_setup import Gains, Layout, LinkSetup, SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, CoreChange, DominanceRamp, LifeOrder, Mode
 from .vectors import Array, IntArray, Points, Row, RowArray
 
@@ -687,7 +687,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     rule = setup.on_stale
     site_layout = setup.layout
     s.rate_hz = setup.rate_hz
-    s.scheme = setup.scheme
+    s.digital = setup.digital
     s.law = gains.law
     s.mode = Mode.RUN
     s.joints = site_layout.joints
@@ -763,9 +763,9 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
     vectors["q"] = setup.q0
     vectors["qd"] = setup.qd0
     vectors["q_before"] = setup.q0
-    if gains.law is Law.USER and setup.theta_known:
+    if gains.is_user and setup.theta_known:
         vectors["known"] = setup.theta
-    has_known_gravity = gains.law is Law.KNOWN
+    has_known_gravity = gains.is_known
     vectors["theta_hat"] = gains.known if has_known_gravity else gains.theta_hat0
     return vectors
 

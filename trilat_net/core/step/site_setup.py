@@ -27,18 +27,6 @@ from .ticks import DominanceRamp
 from .vectors import Array, Points, Vector
 
 
-class Scheme(IntEnum):
-    """Method used to discretise the continuous control law.
-
-    SECOND_ORDER extrapolates the torque to the middle of the control period, and updates the
-    parameter estimate with the trapezoidal rule. DIGITAL uses a zero-order hold and the forward
-    Euler method, like a plain digital controller.
-    """
-
-    SECOND_ORDER = 0
-    DIGITAL = 1
-
-
 class Law(IntEnum):
     """Type of control law used by an arm.
 
@@ -98,6 +86,47 @@ class StaleRule(NamedTuple):
     align_speed: float = 1.0
     align_limit: float = math.inf
     degrades: bool = False
+
+    @property
+    def glides(self) -> bool:
+        """True if the arm comes smoothly to rest while a peer is stale."""
+        return self.action is StaleAction.GLIDE
+
+    @property
+    def is_active(self) -> bool:
+        """True if the site reacts to a stale peer in any way."""
+        return self.action is not StaleAction.USE
+
+    @classmethod
+    def by_age(cls, action: str, age_ns: int, return_ns: int) -> "StaleRule":
+        """Returns a rule under which a peer is stale if its newest sample is too old.
+
+        Args:
+            action: "use", "hold" or "brake", see `StaleAction`.
+            age_ns: Largest age of the newest sample, ns.
+            return_ns: Duration of the return to the peers' reference, ns.
+        """
+        return cls(StaleAction[action.upper()], age_ns, return_ns)
+
+    @classmethod
+    def glide(
+        cls, age_ns: int, align_speed: float, align_limit: float, *, degrades: bool
+    ) -> "StaleRule":
+        """Returns a rule under which the arm comes smoothly to rest while a peer is stale.
+
+        Args:
+            age_ns: Longest time since a new sample could be used, ns.
+            align_speed: Largest speed at which the arm returns to its peers, rad/s or m/s.
+            align_limit: Largest distance over which the arm may return, rad or m.
+            degrades: True if the site continues without a lost peer, see `lost_peers`.
+        """
+        return cls(
+            StaleAction.GLIDE,
+            age_ns,
+            align_speed=align_speed,
+            align_limit=align_limit,
+            degrades=degrades,
+        )
 
 
 class MotionLimits(NamedTuple):
@@ -291,6 +320,21 @@ class Gains(NamedTuple):
     friction: Vector = (1.0,)
     absolute: bool = False
 
+    @property
+    def is_adaptive(self) -> bool:
+        """True if the law estimates the dynamic parameters of the arm."""
+        return self.law is Law.ADAPTIVE
+
+    @property
+    def is_known(self) -> bool:
+        """True if the kernel's law with a known gravity torque computes the torque."""
+        return self.law is Law.KNOWN
+
+    @property
+    def is_user(self) -> bool:
+        """True if a Python class computes the torque, as with the laws of users."""
+        return self.law is Law.USER
+
 
 class SiteSetup(NamedTuple):
     """All settings of an arm and its controller, in numerical form.
@@ -300,7 +344,10 @@ class SiteSetup(NamedTuple):
     Attributes:
         name: Name of the site.
         rate_hz: Tick rate, Hz.
-        scheme: How the law is discretised.
+        digital: True if the law is discretised with a zero-order hold and the forward Euler
+            method, like a plain digital controller. False if the torque is extrapolated to the
+            middle of the control period, and the parameter estimate is updated with the
+            trapezoidal rule.
         gains: The control law and its gains.
         theta: True parameters of the arm, shape (P,).
         g_m_s2: Gravitational acceleration, m/s^2. A chain uses the value in its `ChainSetup`
@@ -329,7 +376,7 @@ class SiteSetup(NamedTuple):
 
     name: str
     rate_hz: int
-    scheme: Scheme
+    digital: bool
     gains: Gains
     theta: Array
     g_m_s2: float

@@ -43,7 +43,7 @@ from .site_arrays import (
     SiteArrays,
     TickBuffers,
 )
-from .site_setup import SiteSetup, StaleAction
+from .site_setup import SiteSetup
 from .ticks import (
     MAX_ARRIVALS,
     NS_PER_S,
@@ -143,7 +143,7 @@ class Site:
         received_counts = [link.channel.received_size for link in setup.links]
         reads_numbers = self._user_law is not None and any(received_counts)
         self._received_counts = received_counts if reads_numbers else None
-        self._glides = setup.on_stale.action is StaleAction.GLIDE
+        self._glides = setup.on_stale.glides
         self._degrades = setup.on_stale.degrades
         self._law_memory: list[float] = []
         if self._law is not None and self._glides:

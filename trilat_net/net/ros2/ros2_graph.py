@@ -431,7 +431,7 @@ class Ros2Graph:
             hashes.
 
     Raises:
-        RouterSilent: No router answers (yet).
+        SessionError: No router answers (yet).
         UsageError: An endpoint is invalid, or belongs to a program that is not a router.
     """
 

@@ -36,14 +36,15 @@ from numpy.typing import NDArray
 from ...analysis import DominanceHistory, SharedSlave, build_arm_rows
 from ...core import POSITION, Array
 from ...errors import LogError, UsageError, count_nouns, join_words
-from ...files import import_extra
+from ...files import Extra
 from ...log import MATRIX_ENTRIES, Ints, Log, collect_provenance, expand_poses
 from ...records import NS_PER_S
 from ...scenario import TASK_AXES
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
 from ..lerobot_observation import find_plugin_actions, observe_as_plugin
 
-_EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
+_EXTRA = Extra("lerobot", "datasets of LeRobot")
+_PARQUET_MODULE = "pyarrow.parquet"
 _FILE = "chunk-000/file-000.parquet"
 _MEANINGS = {
     "observation.state": (
@@ -817,8 +818,8 @@ def _write_tables(
     Returns:
         Statistics of the dataset, for storage in a JSON file.
     """
-    pa = import_extra("pyarrow", *_EXTRA[1:])
-    parquet = import_extra(*_EXTRA)
+    pa = _EXTRA.import_module("pyarrow")
+    parquet = _EXTRA.import_module(_PARQUET_MODULE)
     frames = {}
     for key, column in dataset.items():
         # A vector with one number is stored as a plain number.
@@ -950,4 +951,6 @@ def _compute_statistics(column: NDArray[Any]) -> dict[str, list[float]]:
     return statistics
 
 
-FORMAT = ExportFormat(_write, "-lerobot", folder=True, extra=_EXTRA, many=True)
+FORMAT = ExportFormat(
+    _write, "-lerobot", folder=True, extra=_EXTRA, module=_PARQUET_MODULE, many=True
+)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ...errors import UsageError
-from ...files import import_extra
+from ...files import Extra
 from ...log import Column, Log, Table
 from ..export import ExportFormat, Written, name_inside, store_tables
 
-_EXTRA = ("scipy.io", "mat", "MAT files")
+_EXTRA = Extra("mat", "MAT files")
 _MAX_EXACT_INTEGER = 2**53
 """Limit up to which all integers are exact as doubles, the default numeric type of MATLAB."""
 _KEYWORDS = {
@@ -59,7 +59,7 @@ def _write(log: Log, path: Path, written: Written) -> None:
 
     variables["about_json"] = store_tables(log, written, _name_table, store)
     variables["scenario_toml"] = log.scenario_text
-    savemat = import_extra(*_EXTRA).savemat
+    savemat = _EXTRA.import_module("scipy.io").savemat
     try:
         with path.open("wb") as stream:
             savemat(stream, variables, long_field_names=True, oned_as="column")
@@ -106,4 +106,4 @@ def _convert_column(column: Column, table: Table) -> Any:
     return values.astype(np.float64) if is_exact else values
 
 
-FORMAT = ExportFormat(_write, ".mat", extra=_EXTRA)
+FORMAT = ExportFormat(_write, ".mat", extra=_EXTRA, module="scipy.io")

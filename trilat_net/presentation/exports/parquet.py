@@ -8,6 +8,7 @@ contain the descriptions of the columns and the scenario.
 import io
 from pathlib import Path
 
+from ...files import Extra
 from ...log import Log, Table
 from ..export import ExportFormat, Written, write_table_files
 
@@ -31,6 +32,5 @@ def _write_table(table: Table, path: Path) -> None:
     path.write_bytes(buffer.getbuffer())
 
 
-FORMAT = ExportFormat(
-    _write, "-parquet", folder=True, extra=("polars", "frames", "Parquet files")
-)
+_EXTRA = Extra("frames", "Parquet files")
+FORMAT = ExportFormat(_write, "-parquet", folder=True, extra=_EXTRA, module="polars")

@@ -54,7 +54,7 @@ TimedMessages = tuple[int, int, TopicMessages]
 """
 
 
-def export_ros2(
+def _write(
     log: Log,
     path: Path,
     written: Written = lambda _: None,
@@ -273,4 +273,4 @@ def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
             yield log_ns, publish_ns, [(DIAGNOSTICS, data)]
 
 
-FORMAT = ExportFormat(export_ros2, "-ros2.mcap")
+FORMAT = ExportFormat(_write, "-ros2.mcap")

@@ -3,8 +3,8 @@
 A delay model computes how long each message takes, for example "uniform between 10 ms and 20
 ms". Each model is a class in its own file in this folder; adding a file adds a model.
 
-A model that is built into the simulation kernel names its `DelayKind`. Other models define a
-function of their own, which is compiled.
+A model that is built into the simulation kernel returns one of its `LinkModel`s. Other models
+define a function of their own, which is compiled.
 
 Invariant:
     - Each model states the mean and the standard deviation of its delay in closed form. The
@@ -16,22 +16,19 @@ Invariant:
 """
 
 import math
+from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union
 
-import numpy as np
 from msgspec import Meta
 
 from ...core import (
-    LINK_MODEL_DTYPE,
     MAX_DELAY_US,
-    DelayKind,
     IntArray,
     LinkModel,
     LinkSchedule,
     LinkSetup,
     Points,
-    UserModel,
 )
 from ...fields import Frozen, KeyProblem, TomlTable
 
@@ -59,15 +56,6 @@ def ms_to_us(milliseconds: float) -> int:
     Integer delays make the compiled simulation reproduce the same bits on every machine.
     """
     return round(milliseconds * 1_000)
-
-
-_DETERMINISTIC_KINDS = (
-    DelayKind.CONSTANT,
-    DelayKind.SINE,
-    DelayKind.TRACE,
-    DelayKind.MEASURED,
-)
-"""Delay kinds that are not random."""
 
 
 class _LossChain(NamedTuple):
@@ -135,6 +123,23 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         """Delay of every message, in ms, or None if the delay varies."""
         return None
 
+    @property
+    def repetition_s(self) -> Fraction | None:
+        """Period after which the delay repeats, in s, or None if the delay has no period.
+
+        The period is a fraction of whole numbers, which makes common multiples of periods
+        exact.
+        """
+        return None
+
+    @property
+    def has_ending_trace(self) -> bool:
+        """True if the link plays a delay trace that does not restart at its end.
+
+        The delay after the end is not a repetition, so the link has no period.
+        """
+        return False
+
     def _delay(self) -> LinkModel:
         """Returns the delay of the link in the format read by the compiled simulation.
 
@@ -179,8 +184,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         The run then depends on the seed. Losses are random only if the loss fraction is between
         0 and 1, exclusive.
         """
-        is_delay_drawn = self._delay().kind not in _DETERMINISTIC_KINDS
-        return is_delay_drawn or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
+        return self._delay().is_random or 0.0 < self.loss < 1.0 or 0.0 < self.duplicate < 1.0
 
     @property
     def measured(self) -> bool:
@@ -188,7 +192,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
         Such a link cannot be simulated without the log of a live session.
         """
-        return self._delay().kind == DelayKind.MEASURED
+        return self._delay().is_measured
 
     @property
     def points(self) -> Points | None:
@@ -223,9 +227,9 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         Args:
             receiver_hz: Tick rate of the receiver, in Hz.
         """
-        model = self.to_core_model()
-        if model.kind != DelayKind.CONSTANT or self.loss or self.measured:
+        if self.constant_delay_ms is None or self.loss:
             return math.nan
+        model = self.to_core_model()
         delay_us = max(round(model.location), model.playout_us)
         # rounded up, because without a delay a sample is used from the next tick on
         ticks = max(1, -(-delay_us * receiver_hz // 1_000_000))
@@ -387,22 +391,15 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
 
     @property
     def points(self) -> Points:
-        """Numeric settings of the delay model, packed for the compiled simulation.
-
-        The compiled simulation has one integer table per link, which normally holds a recorded
-        delay trace. The bit patterns of the floating-point settings are stored in this table,
-        two per row.
-        """
-        numbers = UserModel(self).numbers
-        rows = math.ceil(max(len(numbers), 1) / 2)
-        return np.resize(numbers, (rows, 2)).view(np.int64)
+        """Numeric settings of the delay model, packed for the compiled simulation."""
+        return LinkModel.pack_settings(self)
 
     def _delay(self) -> LinkModel:
         """Returns the delay in the format read by the compiled simulation.
 
         The parameter `location` is the longest delay, in microseconds.
         """
-        return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
+        return LinkModel.custom(1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
         """Converts the link to the record read by the compiled simulation.
@@ -413,9 +410,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
             from_ns: Send time of the first message to which these settings apply, in ns after
                 the common start time of all sites.
         """
-        model = super().to_core_model(from_ns)
-        address = UserModel(self).compile_to_address("draw", LINK_MODEL_DTYPE)
-        return model._replace(call=address)
+        return super().to_core_model(from_ns).draw_with(self)
 
 
 DELAY_MODELS = {str(kind.__struct_config__.tag): kind for kind in LinkBase.find_kinds(__name__)}

@@ -5,17 +5,18 @@ converts the keys to the parameters of a probability distribution or of a functi
 computes the mean and the standard deviation of the delay.
 
 Invariant:
-    - Each model names its `DelayKind` in the kernel, the compiled simulation. The kernel draws
+    - Each model names a `LinkModel` of the kernel, the compiled simulation. The kernel draws
       delays from exactly the distribution whose mean and standard deviation the model states.
 """
 
 import math
+from fractions import Fraction
 from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
 
-from ...core import DelayKind, LinkModel, Points
+from ...core import LinkModel, Points
 from ...fields import KeyProblem, TomlTable
 from ..delay_traces import parse_trace
 from ..key_checks import is_number
@@ -24,6 +25,7 @@ from . import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
 """Standard deviation, at least 1 microsecond since delays are integers in microseconds."""
+_US_PER_S = 1_000_000
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
@@ -66,9 +68,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     def _delay(self) -> LinkModel:
         """Returns the mean and the half width in microseconds, for the compiled simulation."""
-        return LinkModel(
-            kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms
-        )
+        return LinkModel.uniform(1e3 * self.delay_ms, 1e3 * self.half_width_ms)
 
     def _describe_delay(self) -> str:
         """Returns the range of the delay, for example "uniform 0 to 400 ms"."""
@@ -106,9 +106,7 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
 
     def _delay(self) -> LinkModel:
         """Returns the mean and the deviation in microseconds, for the compiled simulation."""
-        return LinkModel(
-            kind=DelayKind.NORMAL, location=1e3 * self.delay_ms, scale=1e3 * self.deviation_ms
-        )
+        return LinkModel.normal(1e3 * self.delay_ms, 1e3 * self.deviation_ms)
 
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and the standard deviation of the delay, in ms.
@@ -166,7 +164,7 @@ class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
         scale s^2 / m.
         """
         shape = (self.delay_ms / self.deviation_ms) ** 2
-        return LinkModel(kind=DelayKind.GAMMA, extra=shape, scale=1e3 * self.delay_ms / shape)
+        return LinkModel.gamma(shape, 1e3 * self.delay_ms / shape)
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
@@ -184,9 +182,7 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
         """
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
-        return LinkModel(
-            kind=DelayKind.LOG_NORMAL, location=location, scale=math.sqrt(variance)
-        )
+        return LinkModel.log_normal(location, math.sqrt(variance))
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
@@ -208,12 +204,11 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
     def _delay(self) -> LinkModel:
         """Returns the fixed delay and both means in microseconds, for the simulation."""
-        return LinkModel(
-            kind=DelayKind.HYPER_EXPONENTIAL,
-            location=1e3 * self.floor_ms,
-            scale=1e3 * self.fast_ms,
-            extra=1e3 * self.slow_ms,
-            weight=self.slow_share,
+        return LinkModel.hyper_exponential(
+            floor_us=1e3 * self.floor_ms,
+            fast_us=1e3 * self.fast_ms,
+            slow_us=1e3 * self.slow_ms,
+            slow_share=self.slow_share,
         )
 
     def _moments(self) -> tuple[float, float]:
@@ -246,7 +241,9 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
     def _delay(self) -> LinkModel:
         """Returns mean, deviation and correlation of the delay, for the compiled simulation."""
-        return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
+        return LinkModel.correlated(
+            1e3 * self.delay_ms, 1e3 * self.deviation_ms, self.correlation
+        )
 
     def _moments(self) -> tuple[float, float]:
         """Returns the mean and standard deviation of the delay max(0, x) for normal x, in ms.
@@ -307,7 +304,7 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
 
     def _delay(self) -> LinkModel:
         """Returns the delay as an integer in microseconds, for the compiled simulation."""
-        return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
+        return LinkModel.constant(float(ms_to_us(self.delay_ms)))
 
     def _moments(self) -> tuple[float, float]:
         """Returns the constant delay as the mean, with a standard deviation of zero, in ms."""
@@ -335,14 +332,18 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
     period_s: Annotated[float, Meta(gt=0.0, le=1e6)]
     phase_rad: Annotated[float, Meta(ge=-1e3, le=1e3)] = 0.0
 
+    @property
+    def repetition_s(self) -> Fraction:
+        """Period of the sine, rounded to a whole number of microseconds, in s."""
+        return Fraction(round(1e6 * self.period_s), _US_PER_S)
+
     def _delay(self) -> LinkModel:
         """Returns the parameters of the sine in microseconds, for the compiled simulation."""
-        return LinkModel(
-            kind=DelayKind.SINE,
-            location=1e3 * self.delay_ms,
-            scale=1e3 * self.amplitude_ms,
-            extra=1e6 * self.period_s,
-            weight=self.phase_rad,
+        return LinkModel.sine(
+            mean_us=1e3 * self.delay_ms,
+            amplitude_us=1e3 * self.amplitude_ms,
+            period_us=1e6 * self.period_s,
+            phase_rad=self.phase_rad,
         )
 
     def _moments(self) -> tuple[float, float]:
@@ -380,6 +381,22 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
     def points(self) -> Points:
         """Send times and delays of the trace, in microseconds, shape (n, 2)."""
         return parse_trace(self.trace)
+
+    @property
+    def repetition_s(self) -> Fraction | None:
+        """Duration of a trace that restarts at its end, in s. None if the trace ends."""
+        points = self.points
+        if self.has_ending_trace or len(points) == 1:
+            return None
+        # The last point lasts as long as the point before it.
+        last_us = int(points[-1, 0])
+        end_us = 2 * last_us - int(points[-2, 0])
+        return Fraction(end_us, _US_PER_S)
+
+    @property
+    def has_ending_trace(self) -> bool:
+        """True if the last delay of the trace holds after its end."""
+        return self.at_end == "hold"
 
     def _delay(self) -> LinkModel:
         """Returns the settings of a recorded delay, for the compiled simulation.
@@ -429,7 +446,7 @@ class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
 
     def _delay(self) -> LinkModel:
         """Returns the settings of a link on which no delay is simulated."""
-        return LinkModel(kind=DelayKind.MEASURED)
+        return LinkModel.measured()
 
     def _moments(self) -> tuple[float, float]:
         """Returns NaN twice, since the delay of the real network is not known in advance."""

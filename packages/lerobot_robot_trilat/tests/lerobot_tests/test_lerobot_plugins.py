@@ -15,8 +15,7 @@ import pytest
 
 import trilat_net
 from tests.sites.relay import RelayClock
-from tests.sites.sessions import SESSION, Session, reach_session
-from trilat_net.app.running_session import open_hand
+from tests.sites.sessions import Session, reach_session
 from trilat_net.errors import UsageError
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
@@ -211,7 +210,7 @@ def test_a_person_takes_over_from_a_policy(
 
         @contextmanager
         def hold(_name: str, site: str, source: str, **_: Any) -> Iterator[Any]:
-            with open_hand(bus, clock, SESSION, site, scenario, source) as hand:
+            with reach_session(bus, clock).open_hand(bus, site, scenario, source) as hand:
                 yield hand
 
         monkeypatch.setattr(trilat_net, "hand", hold, raising=False)

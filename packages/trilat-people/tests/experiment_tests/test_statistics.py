@@ -24,7 +24,7 @@ from trilat_people.experiment.statistics import (
 )
 
 from trilat_net.errors import UsageError
-from trilat_net.files import format_extra_install
+from trilat_net.files import Extra
 
 # Student (1908), extra hours of sleep under two drugs; the documentation of R's t.test has
 # t = -4.0621, df = 9, p-value = 0.002833, 95 percent confidence interval -2.4598858 -0.7001142.
@@ -259,7 +259,7 @@ def test_mixed_model_without_its_package_names_the_extra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "statsmodels.formula.api", None)
-    hint = f"mixed models need statsmodels: {format_extra_install('stats')}"
+    hint = f"mixed models need statsmodels: {Extra('stats').install_command}"
     with pytest.raises(UsageError, match=re.escape(hint)):
         fit_mixed_model(tidy(SLEEP), "time_s")
 

@@ -20,8 +20,9 @@ from tests.net.waiting import until
 from tests.page.whole_pages import WatchedPage, watched_page
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
-from trilat_net.app.running_session import open_hand
+from trilat_net.app.running_session import RunningSession
 from trilat_net.net.bus import Bus
+from trilat_net.net.connection import Connection
 from trilat_net.scenario import Scenario, load_scenario
 
 SCREENS: dict[str, dict[str, Any]] = {
@@ -151,7 +152,8 @@ def _record(
 ) -> None:
     view = SessionView(bus, clock, SESSION)
     pages = SessionFrames(view)
-    hand = open_hand(bus, clock, SESSION, recorded.user, scenario, "Ada") if leads else None
+    running = RunningSession(SESSION, Connection(), bus, clock)
+    hand = running.open_hand(bus, recorded.user, scenario, "Ada") if leads else None
     point_count = 0
     energy_count = 0
     event_count = 0

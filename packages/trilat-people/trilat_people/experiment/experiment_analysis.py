@@ -28,7 +28,7 @@ from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
 from trilat_net.fields import split_unit
 from trilat_net.files import find_version, make_folder, write_whole
-from trilat_net.presentation import Block, TextTable, compose, format_number, style
+from trilat_net.presentation import TextTable, format_number, style
 from trilat_net.results import Result
 from trilat_net.work import encode_csv
 
@@ -657,11 +657,8 @@ class ExperimentAnalysis(Result):
         """
         protocol = self._experiment.plan.protocol
         paragraphs = [f"# {protocol.title or protocol.name}"]
-        for block in compose(self):
-            if isinstance(block, TextTable):
-                text = block.markdown()
-            else:
-                text = "\n".join(block.lines())
+        for block in self.blocks():
+            text = block.markdown() if isinstance(block, TextTable) else block
             if text.strip():
                 paragraphs.append(text)
         paragraphs += [f"![{name}]({name}.png)" for name in figures]
@@ -729,7 +726,7 @@ class ExperimentAnalysis(Result):
             "study": self.study,
         }
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[str | TextTable]:
         """Yields the parts of the report that `trilat experiment analyse` prints.
 
         These are a summary of completed trials, the means and comparisons of the measures, the
@@ -768,7 +765,7 @@ class ExperimentAnalysis(Result):
         for name, fact in self.study.items():
             yield f"{name}: {_format_fact(fact, name)}"
 
-    def _write_time_blocks(self) -> Iterator[Block]:
+    def _write_time_blocks(self) -> Iterator[str | TextTable]:
         """Yields a table of completion times: trials, failures and median for each condition.
 
         If some trials were not completed, a second table compares the conditions. Yields
@@ -823,7 +820,7 @@ class ExperimentAnalysis(Result):
             yield TextTable(columns, comparison_rows, align="lrrrrr")
             yield ""
 
-    def _write_measure_blocks(self) -> Iterator[Block]:
+    def _write_measure_blocks(self) -> Iterator[str | TextTable]:
         """Yields two tables for each measure: means of the conditions, and their comparisons.
 
         The second table is omitted if there is only one condition.
@@ -860,7 +857,7 @@ class ExperimentAnalysis(Result):
                 yield TextTable(headers, comparison_rows, align="lrlrrr")
                 yield ""
 
-    def _write_model_blocks(self) -> Iterator[Block]:
+    def _write_model_blocks(self) -> Iterator[str | TextTable]:
         """Yields one table per mixed model: effects of the conditions on the users' forces.
 
         Models exist only if users act in pairs (see `fit_models`).
@@ -880,7 +877,7 @@ class ExperimentAnalysis(Result):
             yield TextTable(("condition", "effect", "interval", "t", "p"), rows, align="lrlrr")
             yield ""
 
-    def _write_single_unit_block(self, unit: str) -> Iterator[Block]:
+    def _write_single_unit_block(self, unit: str) -> Iterator[str | TextTable]:
         """Yields one table of all measures, with one column per condition.
 
         Replaces the tables of means and comparisons, since a single participant or pair allows
@@ -1003,7 +1000,7 @@ class PowerOfExperiment(Result):
             "simulated": simulated,
         }
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[str | TextTable]:
         """Yields the parts of the report that `trilat experiment power` prints.
 
         A table lists the number of participants needed for each power, the probability of

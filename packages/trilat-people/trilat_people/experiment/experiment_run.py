@@ -14,7 +14,7 @@ Invariant:
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +32,6 @@ from trilat_net.work import (
     WorkerPool,
     Workers,
     encode_csv,
-    ignore_progress,
 )
 
 from .completion_times import COMPLETION, find_median, is_completed
@@ -239,7 +238,7 @@ class Experiment(Result):
         return _ExperimentStatus(len(done), len(self.plan.trials), next_trial)
 
     def run(
-        self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
+        self, jobs: int | None = None, show: Progress | None = None, on: Workers = None
     ) -> "Experiment":
         """Runs the remaining trials with synthetic participants and writes the result tables.
 
@@ -631,7 +630,7 @@ def run_experiment(
     *,
     jobs: int | None = None,
     on: Workers = None,
-    progress: Callable[[int, int], None] = ignore_progress,
+    progress: Progress | None = None,
 ) -> Experiment:
     """Runs an experiment with synthetic participants, as `trilat experiment run` does.
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from trilat_net.core import Array
 from trilat_net.errors import UsageError, count_nouns
-from trilat_net.files import import_extra
+from trilat_net.files import Extra
 from trilat_net.work import MeanInterval, wilson_interval
 
 Row = Mapping[str, Any]
@@ -468,8 +468,9 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
         UsageError: statsmodels is not installed, a participant is in two pairs, or there are
             too few means to compare.
     """
-    formulas = import_extra("statsmodels.formula.api", "stats", "mixed models")
-    frames = import_extra("pandas", "stats", "mixed models")
+    extra = Extra("stats", "mixed models")
+    formulas = extra.import_module("statsmodels.formula.api")
+    frames = extra.import_module("pandas")
 
     means = {
         condition: means_by_user

@@ -25,7 +25,7 @@ from rich.console import Console
 from trilat_net.app import SessionResult, compile_core, run_demo
 from trilat_net.errors import LogError, LogRefused, RunFailed
 from trilat_net.files import describe_write_error, make_folder
-from trilat_net.net import Bus, Clock, SystemClock, ZenohBus
+from trilat_net.net import Bus, Clock, Connection, SystemClock
 from trilat_net.records import NS_PER_S
 from trilat_net.signals import Interrupt
 
@@ -403,7 +403,7 @@ def run_with_people(
     plan = experiment.plan
     stage = Stage(plan, clock)
     name = plan.protocol.name
-    with Interrupt() as interrupt, closing(ZenohBus()) as idle:
+    with Interrupt() as interrupt, closing(Connection().open()) as idle:
         for scenario in plan.scenarios.values():
             compile_core(scenario, say, interrupt)
         with PageServer(idle, clock, name, options, ends=True, say=say, stage=stage) as page:
@@ -481,7 +481,7 @@ def _show_session(
     Yields:
         A function that returns True once the session should end.
     """
-    with closing(ZenohBus([], endpoints)) as bus:
+    with closing(Connection(connect=endpoints).open()) as bus:
         page.show(bus, session)
         try:
             yield lambda: watch.over or page.end_requested.is_set()

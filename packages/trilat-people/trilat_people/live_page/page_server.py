@@ -50,7 +50,7 @@ from trilat_net.net import (
     PRIVATE_KEY,
     Bus,
     Clock,
-    ZenohBus,
+    Connection,
     read_member_keys,
     topics,
 )
@@ -1190,7 +1190,7 @@ class PageAttendant(ExitStack):
         Yields:
             A function that returns True once a page has requested the end of the session.
         """
-        bus = self.enter_context(closing(ZenohBus([], endpoints)))
+        bus = self.enter_context(closing(Connection(connect=endpoints).open()))
         page = PageServer(bus, self._clock, session, self._options, ends=True, say=say)
         self._page = self.enter_context(page)
         yield self._page.end_requested.is_set

@@ -42,7 +42,7 @@ from tests.net.manual_clock import ManualClock
 from tests.net.waiting import drained, until
 from tests.scenario.builders import posed_task_text
 from trilat_net.analysis.dominance_history import DominancePlan
-from trilat_net.app.running_session import ShareHistory
+from trilat_net.app.share_history import ShareHistory
 from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
 from trilat_net.files import find_page

@@ -68,7 +68,7 @@ from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.laws import BUILT_IN
-from trilat_net.work.study_folder import encode_csv
+from trilat_net.work.run_journal import encode_csv
 
 WALL_M = 1.3376933693863516
 """Position of the wall of the task with contact."""

@@ -21,8 +21,8 @@ from trilat_studies.sweep.sweep_run import (
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.provenance import collect_provenance
-from trilat_net.work import study_folder as folders
-from trilat_net.work.study_folder import RunJournal
+from trilat_net.work import run_journal as folders
+from trilat_net.work.run_journal import RunJournal
 
 
 def refused(path: Path, *overrides: str, **settings: Any) -> str:

@@ -15,9 +15,11 @@ from trilat_studies.arm_gains import SHARES, ArmGains, tune_arm
 
 import trilat_net as tn
 from tests.cli.running import trilat
+from tests.log.builders import edit_log_bytes
 from tests.scenario.builders import find_robot_files
 from tests.sites.visits import ping_sites
-from trilat_net.errors import TrilatError
+from trilat_net.app.running_session import RunningSession
+from trilat_net.errors import TrilatError, UsageError
 from tuning_tests.mode_count import count_growing
 from tuning_tests.odd_arms import ELBOW, ODD_ARMS, SHOULDER, write_arm
 
@@ -239,11 +241,23 @@ def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
     assert tuned_arm.runs[0]["stable"]
 
 
+def test_unreadable_records_name_the_option(one_joint: Path, tmp_path: Path) -> None:
+    """A log with a record that cannot be decoded is an error of the option --delay."""
+    data = (GOLDEN / "live-4g.mcap").read_bytes()
+    path = tmp_path / "run.mcap"
+    path.write_bytes(edit_log_bytes(data, record=lambda record: {**record, "rx": "none"}))
+    with pytest.raises(UsageError) as error:
+        tune_arm(one_joint, f"measured:{path}", poses=1)
+    message = str(error.value)
+    assert message.startswith(f"delay measured:{path}: a record of ")
+    assert "cannot be read" in message
+
+
 def test_sessions_have_the_delay_of_their_slowest_link(
     one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = ping_sites()  # of a party on the party's clock
-    monkeypatch.setattr("trilat_net.app.session_ping.ping_session", lambda *_, **__: report)
+    monkeypatch.setattr(RunningSession, "ping", lambda _: report)
     arguments = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
     facts = json.loads(trilat(*arguments, cwd=tmp_path).succeeds())
     assert facts["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"

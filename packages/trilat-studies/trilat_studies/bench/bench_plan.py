@@ -28,11 +28,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from trilat_net.core import DominanceMatrix
 from trilat_net.errors import UsageError, suggest_nearest
 from trilat_net.files import write_whole
-from trilat_net.laws import complementary_shares
 from trilat_net.scenario import BUILT_IN, GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-from trilat_net.work import Progress, Workers, ignore_progress
+from trilat_net.work import Progress, Workers
 
 from ..run_commands import format_toml_value
 from ..tuning.candidate import CandidateClass, CandidateScore, TuningScenario
@@ -109,7 +109,7 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
         The nonzero factors, by the name of the arm and by the name of the arm that it follows.
     """
     names = ("m1", "m2", "s")
-    matrix = complementary_shares(a).tolist()
+    matrix = DominanceMatrix.complementary(a).alpha.tolist()
     dominance = {}
     for name, factors in zip(names, matrix, strict=True):
         factors_by_peer = zip(names, factors, strict=True)
@@ -549,7 +549,7 @@ def tune_laws(
     laws_by_form: Mapping[str, Sequence[str]],
     jobs: int | None = None,
     on: Workers = None,
-    progress: Progress = ignore_progress,
+    progress: Progress | None = None,
     budget: int = TUNING_BUDGET,
     known: Iterable[TunedGains] = (),
     store: Callable[[TunedGains], None] = lambda _: None,
@@ -585,7 +585,8 @@ def tune_laws(
                     gains = _tune_law(form, law, round_trip_ms, jobs, on, budget)
                     store(gains)
                 tuned.append(gains)
-                progress(len(tuned), total)
+                if progress is not None:
+                    progress(len(tuned), total)
     return tuned
 
 

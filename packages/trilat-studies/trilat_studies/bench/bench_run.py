@@ -52,14 +52,13 @@ from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
-    StudyFolder,
     WorkerPool,
     Workers,
-    ignore_progress,
 )
 
 from ..measure_run import RecordBatch, WholeRun, describe_program
 from ..side_by_side import RunKind, prepare_kinds
+from ..study_folder import StudyFolder
 from ..tuning.candidate import TuningScenario
 from .bench_plan import (
     SHORTER_REACH,
@@ -814,7 +813,7 @@ ORIGIN_NAME = "origin.json"
 JOURNAL_NAME = "runs.journal"
 
 
-BenchFolder = StudyFolder[BenchPlan, BenchRun]
+BenchFolder = StudyFolder[BenchPlan, RunJournal[BenchRun]]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
@@ -883,7 +882,7 @@ def run_bench(
     folder: BenchFolder,
     jobs: int | None = None,
     on: Workers = None,
-    progress: Progress = ignore_progress,
+    progress: Progress | None = None,
     *,
     confirm: bool = False,  # noqa: ARG001
 ) -> BenchResults:
@@ -962,7 +961,7 @@ def _run_pending(
     items: list[BenchRunItem],
     jobs: int | None,
     on: Workers,
-    progress: Progress,
+    progress: Progress | None,
 ) -> None:
     """Executes the runs that are not yet in the journal, and stores each one when it ends.
 

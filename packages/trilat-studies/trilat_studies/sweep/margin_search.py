@@ -27,7 +27,7 @@ from trilat_net.files import write_whole
 from trilat_net.presentation import TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario
-from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
+from trilat_net.work import Progress, WorkerPool, Workers
 
 from ..run_commands import format_override_value
 from . import sweep_cell
@@ -376,7 +376,7 @@ class SweepMargins(Result):
         plan: SweepPlan,
         within: SearchRange,
         jobs: int | None = None,
-        progress: Progress = ignore_progress,
+        progress: Progress | None = None,
         on: Workers = None,
     ) -> "SweepMargins":
         """Finds the stability edges along one scenario key, at each grid point of a sweep.

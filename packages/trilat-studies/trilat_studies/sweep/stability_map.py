@@ -35,14 +35,13 @@ from numpy.typing import NDArray
 from trilat_net.analysis import GrowthColumn, build_arm_rows
 from trilat_net.core import Array, DominanceMatrix
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.laws import COMMON_MOTION_SHARE, PD, Adaptive
+from trilat_net.laws import COMMON_MOTION_SHARE
 from trilat_net.scenario import (
     LinkBase,
     Scenario,
-    SiteSpec,
     is_number,
 )
-from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
+from trilat_net.work import Progress, WorkerPool, Workers
 
 from ..run_commands import format_override_value
 from .fixed_gains import describe_fixed_gains
@@ -534,8 +533,6 @@ class StabilityEdge(NamedTuple):
         return 0.5 * (self.low + self.high)
 
 
-_GRAVITY = slice(3, 5)
-"""Indices of the arm parameters of Eq. (24) that appear in the gravity torque."""
 _ROUNDING = 1e-6
 """Tolerance for rounding errors, both for delays in ticks and for relative positions of edges.
 """
@@ -658,7 +655,8 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
     K = []
     d = []
     for spec in scenario.sites.values():
-        gains = _find_scalar_gains(spec)
+        # The criteria do not cover different gains, because the arm couples its joints.
+        gains = spec.control.find_uniform_spring()
         if gains is None:
             return None
         K.append(gains[0])
@@ -706,25 +704,6 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
 
 
 _DAMPING_SOURCE = "P+d: sufficient for arms of any mass, and necessary for the worst masses"
-
-
-def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
-    """Returns the gains K and d of a site's P+d law, if they are the same for all joints.
-
-    The criteria do not cover different gains, because the arm couples its joints.
-
-    Returns:
-        K in N m/rad and d in N m s/rad. `None` if the site has another law, no full gravity
-        compensation, or joints with different gains.
-    """
-    law: Any = spec.control
-    if law.kind is not PD or law.gravity != 1.0:
-        return None
-    distinct_K = {*law.K}
-    distinct_d = {*law.d}
-    if len(distinct_K) > 1 or len(distinct_d) > 1:
-        return None
-    return law.K[0], law.d[0]
 
 
 _CIRCLE_POINTS = 400
@@ -852,12 +831,8 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
         Gamma g^2 h < Kp,
 
     where g is the gravitational acceleration, h the period of a tick and Kp the damping gain of
-    the law. This is a rule of thumb for arms of about 1 m, because a factor of length squared,
-    about 1 m^2, is omitted. It holds for the integration scheme `digital`, and for delays of at
-    most one tick.
-
-    Only the gains of the parameters in the gravity torque matter, and the largest of them is
-    used.
+    the law, see `Adaptive.find_sampling_excess`. The rule holds for the integration scheme
+    `digital`, and for delays of at most one tick.
 
     Returns:
         The condition for the site with the smallest excess, Kp - Gamma g^2 h, which is positive
@@ -870,14 +845,11 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
 
     site_excess = []
     for spec in scenario.sites.values():
-        law: Any = spec.control
         tick_s = 1.0 / spec.rate_hz
-        has_adaptive_law = law.kind is Adaptive
-        if not has_adaptive_law or max(delays_s) > tick_s:
+        excess = spec.control.find_sampling_excess(spec.arm.g_m_s2, tick_s)
+        if excess is None or max(delays_s) > tick_s:
             return None
-        largest_gravity_gain = max(law.Gamma[_GRAVITY])
-        required_kp = largest_gravity_gain * spec.arm.g_m_s2**2 * tick_s
-        site_excess.append(min(law.Kp) - required_kp)
+        site_excess.append(excess)
     return StabilityCriterion(
         symbol=r"$\Gamma g^2 h = K_p$",
         text="Gamma g² h = Kp",
@@ -1271,7 +1243,7 @@ class StabilityMap(NamedTuple):
         results: SweepResults,
         commands: tuple[str, ...],
         jobs: int | None = None,
-        progress: Progress = ignore_progress,
+        progress: Progress | None = None,
         *,
         linearly: bool = True,
         on: Workers = None,

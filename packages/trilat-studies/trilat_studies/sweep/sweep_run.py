@@ -41,15 +41,13 @@ from trilat_net.scenario import Scenario
 from trilat_net.work import (
     Progress,
     RunJournal,
-    StudyFolder,
     WorkerPool,
     Workers,
-    ignore_progress,
 )
-from trilat_net.workers import count_cores
 
 from ..measure_run import describe_program
 from ..side_by_side import LANE_SITE_TICKS
+from ..study_folder import StudyFolder
 from . import sweep_cell
 from .cell_groups import CellGroups
 from .edge_refinement import NOT_KNOWN, EdgeRefinement
@@ -79,7 +77,7 @@ first key that differs is reported.
 """
 
 
-SweepFolder = StudyFolder[SweepPlan, CellRun]
+SweepFolder = StudyFolder[SweepPlan, RunJournal[CellRun]]
 """Folder of a sweep, with its plan and its journal."""
 
 
@@ -297,7 +295,7 @@ class DurationEstimate(NamedTuple):
         # If nothing is random, a cell is run with one seed only.
         seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
         runs = max(len(entries), cell_count * seeds - len(finished_runs))
-        workers = min(jobs or count_cores(), runs)
+        workers = min(WorkerPool.count_workers(jobs), runs)
         seconds = elapsed_s / len(entries) * runs / workers
         return cls(runs, seconds, entries)
 
@@ -316,7 +314,7 @@ class DurationEstimate(NamedTuple):
         sizes = " x ".join(str(count) for count in plan.shape if count > 1)
         seeds = f", {count_nouns(len(plan.seeds), 'seed')} each" if len(plan.seeds) > 1 else ""
         cells = count_nouns(plan.cells, "cell")
-        cores = count_nouns(jobs or count_cores(), "core")
+        cores = count_nouns(WorkerPool.count_workers(jobs), "core")
         raise UsageError(
             f"{cells} ({sizes}{seeds}) would take about {format_wall_time(self.seconds)} "
             f"on {cores}; use larger steps for fewer cells, or run the sweep anyway with --yes"
@@ -575,7 +573,7 @@ def _prepare_lanes(plan: SweepPlan, runs: int) -> bool:
 def run_sweep(
     folder: SweepFolder,
     jobs: int | None = None,
-    progress: Progress = ignore_progress,
+    progress: Progress | None = None,
     known: Iterable[CellRun] = (),
     on: Workers = None,
 ) -> FinishedSweep:
@@ -704,7 +702,7 @@ class _SweepWork:
         plan: SweepPlan,
         journal: RunJournal[CellRun],
         pool: WorkerPool,
-        progress: Progress,
+        progress: Progress | None,
         tally: _NewRuns,
     ) -> None:
         self._plan = plan

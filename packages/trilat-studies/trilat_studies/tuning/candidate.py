@@ -94,7 +94,7 @@ def check_comparable(scenario: Scenario) -> None:
         )
 
     # Sites that follow only each other never move towards the other sites.
-    groups = DominanceMatrix(scenario.alpha).find_closed_groups()
+    groups = DominanceMatrix(scenario.alpha).closed_groups
     if len(groups) > 1:
         group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
         raise ScenarioError(

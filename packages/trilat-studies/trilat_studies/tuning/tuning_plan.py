@@ -34,8 +34,7 @@ from trilat_net.net import SystemClock
 from trilat_net.own_code import name_law_classes
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, parse_scenario
-from trilat_net.work import Progress, WorkerPool, Workers, ignore_progress
-from trilat_net.workers import count_cores
+from trilat_net.work import Progress, WorkerPool, Workers
 
 from ..side_by_side import RunKind, prepare_kinds
 from .candidate import (
@@ -463,11 +462,11 @@ class TuningPlan(NamedTuple):
         CandidateScore.measure(probe, None)
         elapsed_s = (clock.monotonic_ns() - start_ns) * 1e-9
         run_s = elapsed_s * scenario.duration_s / probe_s
-        processes = min(jobs or count_cores(), len(self.spaces) * self.budget)
+        processes = min(WorkerPool.count_workers(jobs), len(self.spaces) * self.budget)
         return run_s * self.runs / processes
 
     def run(
-        self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
+        self, jobs: int | None = None, progress: Progress | None = None, on: Workers = None
     ) -> "TuningResult":
         """Searches for the best gains of all laws.
 
@@ -500,7 +499,8 @@ class TuningPlan(NamedTuple):
         finished = 0
 
         def report_progress(in_round: int, _: int) -> None:
-            progress(finished + in_round, total)
+            if progress is not None:
+                progress(finished + in_round, total)
 
         if not is_core_cached():
             # A short run compiles the simulation kernel once, before the processes start.

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 from trilat_net import workers
 from trilat_net.errors import count_nouns
-from trilat_net.net import Clock
+
+from ..net import Clock
 
 MEASURED_NS = 200_000_000
 """Time over which the load is measured, in ns."""

@@ -1,4 +1,4 @@
-"""Manages the folder of a study: its plan, and a journal of the finished runs.
+"""Stores the results of the runs of a study: a journal of the finished runs, and CSV tables.
 
 A study consists of many runs, for example a sweep over parameters. Each finished run is
 appended to the journal as one line, so an interrupted study can continue where it stopped. A
@@ -21,7 +21,7 @@ import os
 import zlib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, BinaryIO, Generic, Protocol, TypeVar
 
 import msgspec
 
@@ -97,7 +97,6 @@ class _JournalEntry(Protocol):
         """Random seed of the run. The runs of one cell differ only in their seeds."""
 
 
-P = TypeVar("P")
 T = TypeVar("T")
 E = TypeVar("E", bound=_JournalEntry)
 
@@ -282,7 +281,7 @@ class RunJournal(Generic[E]):
         tasks: Iterable[T],
         done: int,
         total: int,
-        show: Progress,
+        show: Progress | None,
         together: Together[T, E] | None = None,
         together_count: int = 1,
         note: Callable[[E], None] | None = None,
@@ -297,7 +296,7 @@ class RunJournal(Generic[E]):
             tasks: Tasks of the pending runs, at most `total - done`.
             done: Number of runs finished so far.
             total: Total number of runs.
-            show: Function that is called with the number of finished runs and `total`.
+            show: Function that is called with the number of finished runs and `total`, if any.
             together: Function that executes the runs of several tasks at once.
             together_count: Number of tasks to pass to `together`.
             note: Function that is called with each run after it was written.
@@ -321,7 +320,8 @@ class RunJournal(Generic[E]):
 
             if note is not None:
                 note(entry)
-            show(number, total)
+            if show is not None:
+                show(number, total)
 
     def _write(self, data: bytes) -> None:
         """Appends bytes to the journal, the file with the finished runs of a study.
@@ -344,35 +344,3 @@ class RunJournal(Generic[E]):
         """Returns the CRC-32 of the study's identification and the text of a line."""
         study_checksum = zlib.crc32(self._study.encode())
         return zlib.crc32(text, study_checksum)
-
-
-class StudyFolder(NamedTuple, Generic[P, E]):
-    """The folder of a study, such as a sweep, with its plan, finished runs and results.
-
-    It contains everything that a command needs to continue an interrupted study.
-
-    Attributes:
-        path: Path of the folder.
-        plan: Plan of the study.
-        facts: Plain values that identify the study, its arithmetic and the package versions.
-        remedy: Advice for the error message if the disk is full.
-        journal: Function that opens the journal.
-    """
-
-    path: Path
-    plan: P
-    facts: Mapping[str, Any]
-    remedy: str
-    journal: Callable[[], RunJournal[E]]
-
-    def read_done(self) -> list[tuple[Any, int]]:
-        """Reads from the journal which runs of the study have finished.
-
-        An interrupted study continues with the remaining runs.
-
-        Returns:
-            The cell (the part of the study) and the seed of each finished run. Empty if no run
-            has finished.
-        """
-        with self.journal() as journal:
-            return list(journal.done)
