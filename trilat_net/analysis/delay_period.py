@@ -33,22 +33,6 @@ If there is no such span, the span with the smallest change is used, up to half 
 """
 
 
-def find_link_period_s(link: LinkBase) -> float | None:
-    """Returns the period after which the delay of a link repeats, in s.
-
-    For example, a sinusoidal delay of 0.5 Hz has a period of 2 s.
-
-    Args:
-        link: Delay model of the link.
-
-    Returns:
-        The period, or `None` if the delay is constant, random or measured, or follows a trace
-        that ends.
-    """
-    repetition_s = link.repetition_s
-    return None if repetition_s is None else float(repetition_s)
-
-
 def _find_common_period(cycles: Iterable[Fraction], common_hz: int) -> Fraction:
     """Returns the shortest time that contains a whole number of ticks and of all cycles, in s.
 

@@ -289,22 +289,12 @@ class RunFindings(NamedTuple):
     doubts: Sequence[Doubt] = ()
     rises: bool = False
 
-    @property
-    def has_proof(self) -> bool:
-        """True if the theorem, a control law or exact roots prove the loop stable."""
-        return self.is_covered or bool(self.law_proofs) or self.proven_by_roots == "stable"
-
-    @property
-    def proven_by_roots(self) -> str:
-        """The verdict proven by the roots: "stable", "unstable", or empty if there is none."""
-        return "" if self.roots is None else self.roots.proven
-
     def decide(self) -> "StabilityDecision":
         """Decides from all evidence whether a run is stable, settled, not stable, or open.
 
         The docstring of the module defines these verdicts.
         """
-        obstacles = _list_obstacles(self)
+        obstacles = self._list_obstacles()
         decision = _decide_by_roots(self, obstacles)
         if decision is not None:
             return decision
@@ -338,7 +328,43 @@ class RunFindings(NamedTuple):
 
         This is the case if the run diverged, or if its exact roots and its end agree.
         """
-        return _decide_by_roots(self, _list_obstacles(self)) is not None
+        return _decide_by_roots(self, self._list_obstacles()) is not None
+
+    def _list_obstacles(self) -> tuple[Obstacle, ...]:
+        """Lists the findings that prevent the judgements "stable" and "settled", in order.
+
+        Such findings concern the end of the run, missing records, runs with small pushes,
+        doubts of other analyses, and roots that show growth.
+        """
+        obstacles: list[Obstacle] = []
+        if self.end.doubts:
+            obstacles.append("end")
+        if self.end.missing_sites:
+            obstacles.append("missing records")
+        twins = self.twins
+        if twins is not None and twins.hides_period and not self.has_proof:
+            obstacles.append("hidden period")
+        if self.doubts:
+            obstacles.append("doubts")
+        roots = self.roots
+        if roots is not None and roots.verdict == "unstable":
+            # Twins repeat the recorded ticks. Roots that are not exact do not count if the
+            # twins exclude growth at their rate.
+            excluded_per_s = math.inf if twins is None else twins.excluded_rate_per_s
+            is_excluded = roots.rate_per_s is not None and roots.rate_per_s > excluded_per_s
+            if roots.exact or not is_excluded:
+                obstacles.append("growing roots")
+        return tuple(obstacles)
+
+    @property
+    def has_proof(self) -> bool:
+        """True if the theorem, a control law or exact roots prove the loop stable."""
+        return self.is_covered or bool(self.law_proofs) or self.proven_by_roots == "stable"
+
+    @property
+    def proven_by_roots(self) -> str:
+        """The verdict proven by the roots: "stable", "unstable", or empty if there is none."""
+        return "" if self.roots is None else self.roots.proven
 
 
 class StabilityDecision(NamedTuple):
@@ -386,36 +412,6 @@ class StabilityDecision(NamedTuple):
     def is_too_short(self) -> bool:
         """True if only the length of the recording prevents a better decision."""
         return "short record" in self.obstacles
-
-
-def _list_obstacles(run: RunFindings) -> tuple[Obstacle, ...]:
-    """Lists the findings that prevent the judgements "stable" and "settled", in order.
-
-    Such findings concern the end of the run, missing records, runs with small pushes, doubts of
-    other analyses, and roots that show growth.
-
-    Args:
-        run: Findings of the analyses on the run.
-    """
-    obstacles: list[Obstacle] = []
-    if run.end.doubts:
-        obstacles.append("end")
-    if run.end.missing_sites:
-        obstacles.append("missing records")
-    twins = run.twins
-    if twins is not None and twins.hides_period and not run.has_proof:
-        obstacles.append("hidden period")
-    if run.doubts:
-        obstacles.append("doubts")
-    roots = run.roots
-    if roots is not None and roots.verdict == "unstable":
-        # Twins repeat the recorded ticks. Roots that are not exact do not count if the twins
-        # exclude growth at their rate.
-        excluded_per_s = math.inf if twins is None else twins.excluded_rate_per_s
-        is_excluded = roots.rate_per_s is not None and roots.rate_per_s > excluded_per_s
-        if roots.exact or not is_excluded:
-            obstacles.append("growing roots")
-    return tuple(obstacles)
 
 
 def _decide_by_roots(

@@ -38,10 +38,7 @@ from ...files import find_page
 from ...laws import LinearForm
 from ...records import NS_PER_S
 from ...scenario import LinkBase, Scenario
-from ..delay_period import (
-    MAX_PERIOD_TICKS,
-    find_link_period_s,
-)
+from ..delay_period import MAX_PERIOD_TICKS
 from .numeric_law import NumericLaw
 from .site_dynamics import (
     ArgumentLayout,
@@ -507,8 +504,8 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
 
 def _has_long_period(link: LinkBase, rate_hz: int) -> bool:
     """Returns True if a link's delay repeats only after more ticks than can be analysed."""
-    period_s = find_link_period_s(link)
-    return period_s is not None and period_s * rate_hz > MAX_PERIOD_TICKS
+    period_s = link.repetition_s
+    return period_s is not None and float(period_s) * rate_hz > MAX_PERIOD_TICKS
 
 
 def compute_effective_delay(
@@ -547,11 +544,11 @@ def compute_effective_delay(
     if is_constant:
         # ages repeat, so two seconds beyond the delay contain all of them
         duration_s = min(duration_s, 2.0 + 2e-6 * model.location)
-    period_s = find_link_period_s(link)
+    period_s = link.repetition_s
     if period_s is not None and not _has_long_period(link, max(site_hz, peer_hz)):
         # ages are complete when the samples of a whole period have arrived
         longest_s = 2e-3 * sum(link.moments())
-        duration_s = max(duration_s, period_s + longest_s)
+        duration_s = max(duration_s, float(period_s) + longest_s)
     used_samples = link.draw_used_samples(
         key=link_key(scenario.seed, f"{peer}->{site}"),
         receiver_hz=site_hz,
@@ -598,7 +595,7 @@ def has_lasting_delays(scenario: Scenario) -> bool:
             if table[-1, 0] > 1e6 * scenario.duration_s:
                 return False
             continue
-        if find_link_period_s(link) is None or link.random:
+        if link.repetition_s is None or link.random:
             continue
 
         rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
