@@ -494,9 +494,9 @@ def _compute_percentiles(
 
 
 def _count_executed_ticks(log: Log, site: str) -> int | None:
-    """Returns how many control periods (ticks) an arm's process executed, by its own report.
+    """Returns the number of control periods (ticks) that the process of an arm executed.
 
-    The process reports this number in its event "end" at the end of a run.
+    The process itself reports the number in its event "end" at the end of a run.
 
     Args:
         log: The log of the run.

@@ -505,7 +505,7 @@ def _confirms_slowest_root(run: RunFindings) -> bool:
 
 
 def _is_end_excused(run: RunFindings) -> bool:
-    """Returns True if pushes or roots show that an unstable-looking end is no evidence.
+    """Returns True if an end that looks unstable is not evidence of an unstable loop.
 
     The cases are:
 

@@ -95,7 +95,7 @@ class _ModeInterval(NamedTuple):
 
 
 class _RaisedAlarm(NamedTuple):
-    """An interval in which a site raised an alarm: it held, was stopped, or had a fault.
+    """An interval in which a site raised an alarm: a hold, a stop or a fault of its arm.
 
     Alarms exist only at sites whose rule for silent peers (`on_stale` of the scenario) is
     "glide". With this rule an arm comes to rest smoothly when it no longer hears from its

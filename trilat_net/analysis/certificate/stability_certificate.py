@@ -427,5 +427,5 @@ def _last_values(columns: dict[str, Array]) -> dict[str, float]:
 
 
 def _largest(values: Array) -> float:
-    """Returns the largest absolute value."""
+    """Returns the largest absolute value of an energy over time, in J."""
     return float(np.abs(values).max())

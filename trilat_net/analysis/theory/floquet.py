@@ -740,7 +740,7 @@ def _find_multipliers(
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
     """Returns the largest multipliers of a span map, by the block Arnoldi method.
 
-    The method applies the map again and again, each time to the block of columns that the last
+    The method applies the map repeatedly, each time to the block of columns that the last
     application added, and keeps an orthonormal basis of all columns so far. The eigenvalues of
     the small matrix H, which is the map in this basis, approach the largest multipliers. The
     method ends when all wanted multipliers are exact, when no new direction is found, or when

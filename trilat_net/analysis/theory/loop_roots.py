@@ -287,7 +287,7 @@ class _FixedDelays(NamedTuple):
 
 
 class _EndState(NamedTuple):
-    """Poses of all arms at the end of a run, near which to search for a pose of rest.
+    """Poses of all arms at the end of a run, from which the search for a pose of rest starts.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad.

@@ -684,7 +684,7 @@ def _judge_worst_joint(
     """Evaluates the effect of a push at all joints of a group together, or at the worst joint.
 
     Slow growth at one joint is invisible in the amplitude of the group while a faster joint
-    still decays from a larger amplitude. Therefore each joint is judged by itself, too.
+    still decays from a larger amplitude. Therefore each joint is also judged separately.
 
     Args:
         path: The twin's difference from its run.
