@@ -1,8 +1,9 @@
 """Analyses the control loop of arms at rest in one common pose, with arbitrary gains.
 
-The search for the gains of an arm (`trilat tune --arm`) needs a single result: the rate at
-which small motions about a pose grow with these gains. `RestingLoop` computes it for any pose,
-any gains, and either the delays of the scenario or a constant delay.
+The search for the gains of an arm (`trilat tune --arm`) needs the rate at which small motions
+about a pose grow with these gains. `RestingLoop` computes the rate for any pose, any gains, and
+either the delays of the scenario or a constant delay. For comparison, it also determines the
+rate at which the motion of a simulated run grows.
 
 Invariant:
     - The gains and the start poses of the scenario have no effect.
