@@ -24,7 +24,14 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from trilat_net.errors import WireError, count_nouns
-from trilat_net.log import CHANNEL_TYPES, SITE_CHANNELS, Account, SessionScenario, StartGap
+from trilat_net.log import (
+    CHANNEL_TYPES,
+    SITE_CHANNELS,
+    Account,
+    SessionScenario,
+    StartGap,
+    count_skipped_ticks,
+)
 from trilat_net.net import (
     Backfill,
     Clock,
@@ -39,7 +46,6 @@ from trilat_net.net import (
     split_states,
     topics,
 )
-from trilat_net.recorded_change import count_skipped_ticks
 
 AWAY_NS = 15_000_000_000
 """Time to wait for a site that disappeared without an "end" event, in ns.

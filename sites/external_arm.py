@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from trilat_net.core import RELEASE_REASONS, LifeReason, PlantState, Site
+from trilat_net.core import PlantState, Site
 from trilat_net.errors import SessionError, WireError
 from trilat_net.files import find_page
 from trilat_net.net import ArmEnable, ArmMeasurement, Clock, StampedInbox, decode
@@ -403,15 +403,14 @@ class DeadManSwitch:
             self._accept(payload, received_ns)
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
-    def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
+    def pop_order(self, site: Site) -> SiteOrder:
         """Returns the command that follows from the dead-man switch: to stop, or to move again.
 
         While the switch is released, every call returns the command to stop, until the arm has
         stopped for this reason or its site reports a fault.
 
         Args:
-            mode: Current mode of the site, for example stopped.
-            reason: Reason why the site is in this mode.
+            site: The site, with its current mode and the reason for it.
 
         Returns:
             "released" if the arm must stop, "held" if it may move again, or an empty string if
@@ -421,12 +420,10 @@ class DeadManSwitch:
         self._was_released = False
 
         if was_released or not self.held:
-            is_stopped_already = mode == Mode.STOPPED and reason in RELEASE_REASONS
-            needs_no_order = is_stopped_already or mode == Mode.FAULT
+            needs_no_order = site.is_braked or site.mode is Mode.FAULT
             return "" if needs_no_order else "released"
 
-        is_stopped_by_switch = mode == Mode.STOPPED and reason == LifeReason.RELEASED
-        return "held" if is_stopped_by_switch else ""
+        return "held" if site.awaits_switch else ""
 
     def _release(self, released: Sequence[_Holder]) -> None:
         """Marks the dead-man switch of the arm as released, which stops the arm.

@@ -222,7 +222,7 @@ def run_hand(
         RunFailed: The class failed.
     """
     hand_site = HandSite.find(scenario, name)
-    if hand_site is None or not hand_site.has_separate_process:
+    if hand_site is None or not scenario.sites[name].needs_hand_process:
         problem = "has no hand of kind 'own' with process = true"
         raise UsageError(
             f"{name} {problem}: either the site runs its hand itself, or the scenario has no "

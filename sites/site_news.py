@@ -15,14 +15,12 @@ import numpy as np
 
 from trilat_net.core import (
     LifeAlarm,
-    LifeReason,
     describe_mode,
     tick_ns,
 )
 from trilat_net.errors import count_nouns
-from trilat_net.log import compute_task_errors
+from trilat_net.log import compute_task_errors, count_skipped_ticks
 from trilat_net.net import MODE_WORDS, EventPublisher
-from trilat_net.recorded_change import count_skipped_ticks
 from trilat_net.records import NS_PER_S, Mode, TickRecord
 from trilat_net.scenario import Change
 
@@ -203,8 +201,7 @@ class SiteNews:
             return
 
         second = output.t_ns // NS_PER_S
-        is_too_far = self._parts.site.life_reason is LifeReason.ALIGN_LIMIT
-        if is_too_far and second > self._waiting_s:
+        if self._parts.site.is_too_far and second > self._waiting_s:
             self._waiting_s = second
             text = describe_mode(self._parts.name, output, glides=True)
             self._publisher.publish("waiting", text, t_ns=output.t_ns, ticks=output.tick)

@@ -20,7 +20,6 @@ from trilat_net.core import (
     Site,
     SiteSetup,
     TickInput,
-    first_tick_at,
     tick_ns,
 )
 from trilat_net.errors import LawFailed, WireError
@@ -251,7 +250,7 @@ class SiteParts:
             return
 
         own_hand = HandSite.find(self.scenario, name)
-        if own_hand is not None and not own_hand.has_separate_process:
+        if own_hand is not None and not self.scenario.sites[name].needs_hand_process:
             run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
             self.hand = HandPlayer(own_hand, own_hand.make_program(), run_hand)
             return
@@ -354,7 +353,7 @@ class SiteParts:
         mode = self.site.mode
         orders: list[SiteOrder] = [self.arm.pop_order(mode)]
         if self.switch is not None:
-            orders.append(self.switch.pop_order(mode, self.site.life_reason))
+            orders.append(self.switch.pop_order(self.site))
         changes += [self._make_order_change(tick, order) for order in orders if order]
         return changes
 
@@ -482,7 +481,7 @@ def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickR
         site: The site in the simulation kernel.
         step: Function that computes a tick of the site.
     """
-    site.start_at(first_tick_at(0, site.rate_hz))
+    site.start_at(0)
     site.release_tick(0, 0)  # as when a site joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None

@@ -28,7 +28,7 @@ from trilat_net.net import (
     topics,
 )
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Scenario, check_outside_arms
+from trilat_net.scenario import Scenario
 from trilat_net.signals import Interrupt
 
 from .external_arm import ExternalArm
@@ -67,7 +67,7 @@ def run_site(
             in the scenario, or the scenario lacks the limits of an external arm.
         RunFailed: The run diverged, the user's law failed, or the arm fell silent.
     """
-    check_outside_arms(scenario)
+    scenario.check_outside_arms()
     # A site that rejoins a session needs its keys only until the end of the run, see
     # `_join_session`.
     if not scenario.sites_may_return:

@@ -5,8 +5,6 @@ string. The types of this module allow programs that only forward or store recor
 these strings without the scenario.
 """
 
-from collections.abc import Sequence
-from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -60,20 +58,3 @@ class RecordedChange(
     site: str = ""
     order: SiteOrder = ""
     ticks: Annotated[int, Meta(ge=0, lt=2**40)] = 0
-
-
-def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns how many ticks an arm missed just before a record.
-
-    Ticks are missed if the control loop is too late. A record contains the changes applied in
-    its tick, including those that report missed ticks.
-
-    Args:
-        texts: Changes in the record, as JSON strings. Invalid strings are ignored.
-    """
-    skipped = 0
-    for text in texts:
-        if "overrun" in text:
-            with suppress(msgspec.MsgspecError):
-                skipped += msgspec.json.decode(text, type=RecordedChange).ticks
-    return skipped

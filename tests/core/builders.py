@@ -11,7 +11,7 @@ from tests.core.chain_references import chain_references
 from tests.scenario.builders import make_scenario
 from trilat_net.core.arms.chain import ChainJoint
 from trilat_net.core.links.channel import LOST, schedule_deliveries
-from trilat_net.core.links.delay import LINK_MODEL_DTYPE, DelayKind, LinkModel, TraceEnd
+from trilat_net.core.links.delay import LINK_MODEL_DTYPE, DelayKind, LinkModel
 from trilat_net.core.links.link import link_dtype
 from trilat_net.core.links.philox import link_key
 from trilat_net.core.step.site_arrays import SiteArrays
@@ -210,7 +210,7 @@ KINDS: dict[str, LinkModel] = {
     "sine": LinkModel(
         kind=DelayKind.SINE, location=100_000.0, scale=80_000.0, extra=20_000.0, weight=0.5
     ),
-    "trace": LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd.LOOP, trace_count=3),
+    "trace": LinkModel.follow_trace("loop")._replace(trace_count=3),
     "measured": LinkModel(kind=DelayKind.MEASURED),
     "bursts": LinkModel(location=5_000.0, loss_bad=0.9, enter=0.3, leave=0.4),
     "single losses": LinkModel(location=5_000.0, loss_good=0.4),

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from tests.log.builders import open_bytes, simulate_bytes
-from trilat_net.core.step.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
+from trilat_net.core.step.ticks import CoreChange, LifeReason, tick_ns
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import RESTING_MODES
 from trilat_net.own_code.code_consent import allow_own_code
@@ -92,7 +92,7 @@ def list_reasons(log: Log, site: str) -> list[tuple[str, LifeReason]]:
     """Returns the modes of a site in order, each with its reason."""
     modes: list[tuple[str, LifeReason]] = []
     for state in log[site].states:
-        reason = find_life_reason(state.to_tick_record(log[site].peers))
+        reason = LifeReason.of_record(state.to_tick_record(log[site].peers))
         if not modes or modes[-1] != (state.mode, reason):
             modes.append((state.mode, reason))
     return modes

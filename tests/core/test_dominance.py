@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from trilat_net.core.links.dominance import DominanceMatrix
-from trilat_net.scenario.validate import find_row_problem
+from trilat_net.scenario.dominance_rows import find_row_problem
 
 Array = NDArray[np.float64]
 SMALLEST = 1e-6

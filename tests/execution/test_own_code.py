@@ -19,7 +19,6 @@ from trilat_net.log.log_reader import Log
 from trilat_net.own_code.imported_code import allowed_code
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
-from trilat_net.scenario.plant_player import PlantPlayer
 
 SIGNALS = ("q", "qd", "tau", "q_des", "tau_x", "theta_hat")
 
@@ -269,7 +268,7 @@ def test_compiled_runs_pause_for_a_plant(rate_hz: int) -> None:
         "paper", {**with_plant(), "duration_s": 1.0, "sites.s.rate_hz": rate_hz}
     )
     log = SimulatedLog(scenario)
-    run = FusedRun(scenario, keep=2000, plants=PlantPlayer.make_all(scenario))
+    run = FusedRun(scenario, keep=2000, runs_plants=True)
     for until_s in (0.3, 0.3015, 1.0):
         run.advance_to(until_s)
     for (_, rows), site in zip(run.pop_records(), scenario.names, strict=True):

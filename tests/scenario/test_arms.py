@@ -17,7 +17,6 @@ from trilat_net.core.step.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verification import verify_log
 from trilat_net.scenario import load_scenario, parse_embedded
-from trilat_net.scenario.describe import list_arm_notes
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
 from trilat_net.scenario.simulated_arm import SimulatedArm
 from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
@@ -169,7 +168,7 @@ def test_arms_may_start_slightly_beyond_stops() -> None:
     assert m1.lower == s.lower == -2.0 * math.pi
     assert any(
         "s starts 0.0568 rad beyond a stop of joint shoulder_pan" in x
-        for x in list_arm_notes(scenario)
+        for x in scenario.list_arm_notes()
     )
     error = refusal({"sites.s.q0_rad": [-6.44, -0.3, 0.5, 0.0, 0.0, 0.0]})
     assert error.path == "sites.s.q0_rad[0]"
@@ -198,7 +197,7 @@ def test_position_limits_yield_to_nearby_starts() -> None:
     assert scenario.setup("s").limits.q_max == 2.0
     assert any(
         "q_max_rad of joint q1: the limit lies at 2.15 rad" in x
-        for x in list_arm_notes(scenario)
+        for x in scenario.list_arm_notes()
     )
     with pytest.raises(ScenarioError, match=r"start at most 0\.15 rad"):
         load_scenario("play", {**limits, "sites.m1.q0_rad": [2.16, 0.5]})

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.core.links.channel import LOST
-from trilat_net.core.links.delay import MAX_DELAY_US, TraceEnd
+from trilat_net.core.links.delay import MAX_DELAY_US, LinkModel
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario.delay_traces import (
@@ -108,7 +108,7 @@ def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
     )
     assert load_scenario(path).links["m1->s"].trace == TEXT
     setup = loaded.setup("s").links[0]
-    assert setup.models[0].at_end == TraceEnd.LOOP
+    assert setup.models[0].at_end == LinkModel.follow_trace("loop").at_end
     assert setup.traces[0] is not None
     assert setup.traces[0].tolist() == POINTS
 

@@ -13,10 +13,10 @@ from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import (
     ScenarioDifference,
     describe_scenario,
-    describe_value,
 )
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
 from trilat_net.scenario.rest_bounds import find_rest_bounds
+from trilat_net.scenario.value_text import describe_value
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

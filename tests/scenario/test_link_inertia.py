@@ -15,7 +15,7 @@ from tests.scenario.builders import make_six_joint_scenario
 from trilat_net.core.arms.chain import Matrix
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_embedded
-from trilat_net.scenario.describe import describe_scenario, list_arm_notes
+from trilat_net.scenario.describe import describe_scenario
 from trilat_net.scenario.link_inertia import LinkInertia, balance_tensor, fill_tensor
 from trilat_net.scenario.urdf import UrdfChain, read_urdf
 
@@ -315,7 +315,7 @@ def test_differences_from_the_file_are_listed() -> None:
     scenario = make_arm_scenario(
         FINGER, {"tip": "lower", "links": {"upper": {"mass_kg": 2.0}}}, m={"q0_rad": [2.1, 0]}
     )
-    notes = list_arm_notes(scenario)
+    notes = scenario.list_arm_notes()
     assert any("arm of m, s: link 'upper': mass_kg of the scenario" in note for note in notes)
     assert any("arm of m, s: link 'finger' does not lead" in note for note in notes)
     assert any("m starts 0.1 rad beyond a stop of joint shoulder" in note for note in notes)

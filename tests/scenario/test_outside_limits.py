@@ -8,7 +8,6 @@ import pytest
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
-from trilat_net.scenario.validate import check_outside_arms
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLANAR = EXAMPLES / "external_arm.toml"
@@ -37,14 +36,14 @@ def test_unstated_limits_of_real_arms_are_refused(key: str, tmp_path: Path) -> N
     """The error names the key and shows how to write it."""
     scenario = write_scenario(tmp_path, PLANAR, key)
     with pytest.raises(ScenarioError, match=f"is missing: .*, as in {key} = ") as caught:
-        check_outside_arms(scenario)
+        scenario.check_outside_arms()
     assert caught.value.path == f"sites.s.limits.{key}"
 
 
 @pytest.mark.parametrize("limit", ["60.0", "[60.0, 200.0]", "[200.0, 200.0]"])
 def test_every_stated_limit_is_accepted(limit: str, tmp_path: Path) -> None:
     """A list states a limit of each joint, even if all numbers equal the default."""
-    check_outside_arms(write_scenario(tmp_path, PLANAR, "tau_limit_nm", limit))
+    write_scenario(tmp_path, PLANAR, "tau_limit_nm", limit).check_outside_arms()
 
 
 @pytest.mark.parametrize("key", FILE_KEYS)
@@ -53,14 +52,14 @@ def test_urdf_files_state_limits_of_real_arms(key: str, tmp_path: Path) -> None:
     urdf = (SHIPPED_FOLDER / "arm6.urdf").read_text(encoding="utf-8")
     file = tmp_path / "mine.urdf"
     file.write_text(urdf, encoding="utf-8")
-    check_outside_arms(write_scenario(tmp_path, CHAIN, key))
+    write_scenario(tmp_path, CHAIN, key).check_outside_arms()
 
     unstated = re.sub(rf'{FILE_KEYS[key]}="[^"]*"', f'{FILE_KEYS[key]}="0"', urdf, count=1)
     assert unstated != urdf
     file.write_text(unstated, encoding="utf-8")
     scenario = write_scenario(tmp_path, CHAIN, key)
     with pytest.raises(ScenarioError, match=f"<limit {FILE_KEYS[key]}=...> in its URDF"):
-        check_outside_arms(scenario)
+        scenario.check_outside_arms()
 
 
 @pytest.mark.parametrize("action", ["use", "hold", "brake"])

@@ -13,7 +13,7 @@ from trilat_net.core.links.delay import DelayKind, LinkModel
 from trilat_net.core.step.ticks import DominanceRamp, first_tick_at
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
-from trilat_net.scenario import Scenario, load_scenario, parse_core_change
+from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.run_changes import LinkTables, resolve_change
 
 S = 10**9
@@ -120,7 +120,7 @@ def test_recorded_commands_are_restored(to: dict[str, Any], from_ns: int) -> Non
     change = scenario.to_core_change(
         resolve_order(scenario, {"link": "s->m1", "to": to}, from_ns)
     )
-    assert parse_core_change(scenario, "m1", change.text) == change
+    assert scenario.parse_core_change("m1", change.text) == change
     assert change.model is not None
     assert change.model.from_ns == from_ns
 
@@ -204,8 +204,8 @@ def test_records_of_unknown_commands_are_refused(text: str) -> None:
     scenario = load_scenario("paper")
     for valid in (good, row):
         assert (
-            parse_core_change(scenario, "s", json.dumps(valid)).text
+            scenario.parse_core_change("s", json.dumps(valid)).text
             == msgspec.json.encode(valid).decode()
         )
     with pytest.raises(ScenarioError):
-        parse_core_change(scenario, "s", text)
+        scenario.parse_core_change("s", text)

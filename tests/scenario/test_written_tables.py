@@ -5,10 +5,10 @@ import pytest
 
 from trilat_net.errors import ScenarioError
 from trilat_net.recorded_change import RecordedChange
-from trilat_net.scenario import Scenario, SiteSpec, list_shipped, load_scenario
+from trilat_net.scenario import Scenario, list_shipped, load_scenario
 from trilat_net.scenario.key_checks import field_names
 from trilat_net.scenario.refusals import check_table
-from trilat_net.scenario.site_spec import SITE_GROUPS
+from trilat_net.scenario.site_spec import SITE_GROUPS, SiteSpec
 from trilat_net.scenario.written_kinds import written_kind
 from trilat_net.scenario.written_tables import WrittenChange, WrittenScenario, WrittenSite
 

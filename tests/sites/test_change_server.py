@@ -17,7 +17,7 @@ from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
-from trilat_net.scenario import Scenario, load_scenario, parse_core_change
+from trilat_net.scenario import Scenario, load_scenario
 
 SESSION = "changes"
 KEY = topics.key(SESSION, "s", topics.SET)
@@ -54,7 +54,7 @@ def test_accepted_changes_name_their_recorded_first_tick(k: int) -> None:
     (taken,), reply = requests.ask(k, link="m1->s", to={"delay_ms": 350.0, "loss": 0.05})
     assert reply.accepted
     assert reply.tick == k + AHEAD_MS
-    assert parse_core_change(requests.scenario, "s", taken.text) == taken
+    assert requests.scenario.parse_core_change("s", taken.text) == taken
     assert taken.model is not None
     assert (taken.peer, taken.model.from_ns) == (0, reply.tick * 1_000_000)
     assert (taken.model.location, taken.model.loss_good) == (350_000.0, 0.05)

@@ -22,6 +22,7 @@ from sites.external_arm import (
     DeadManSwitch,
     ExternalArm,
 )
+from tests.core.builders import make_site_setup
 from tests.log.builders import rewrite_log
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
@@ -375,25 +376,35 @@ class Switch:
         return self.switch.held
 
 
+def stand(mode: Mode, reason: LifeReason) -> Site:
+    """Returns a site that has changed to a mode for a reason."""
+    site = Site(make_site_setup())
+    site.arrays.site["mode"] = mode
+    site.arrays.site["reason"] = reason
+    return site
+
+
 def test_switches_hold_until_released_or_silent() -> None:
     dead_man = Switch()
     switch = dead_man.switch
     clock = dead_man.clock
     ring = dead_man.ring
     hear = dead_man.hear
-    assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
-    assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == "released"
-    assert switch.pop_order(Mode.STOPPED, LifeReason.STOP_RELEASED) == ""
-    assert switch.pop_order(Mode.FAULT, LifeReason.START) == ""
+    assert switch.pop_order(stand(Mode.RUN, LifeReason.START)) == "released"
+    assert switch.pop_order(stand(Mode.STOPPED, LifeReason.STOP)) == "released"
+    assert switch.pop_order(stand(Mode.STOPPED, LifeReason.STOP_RELEASED)) == ""
+    assert switch.pop_order(stand(Mode.FAULT, LifeReason.START)) == ""
     assert not hear(1, 0, site="m")
     assert hear(1, 5)
-    assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
-    assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == ""  # that ends by an order alone
+    assert switch.pop_order(stand(Mode.STOPPED, LifeReason.RELEASED)) == "held"
+    assert (
+        switch.pop_order(stand(Mode.STOPPED, LifeReason.STOP)) == ""
+    )  # that ends by an order alone
     assert hear(2, 0, held=False)  # of one that does not hold it
     sleep_for_ns(clock, SWITCH_SILENCE_NS)
     assert switch.held
     assert not hear(1, 5, after_ns=1)  # said before
-    assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == ""
+    assert switch.pop_order(stand(Mode.STOPPED, LifeReason.RELEASED)) == ""
     assert hear(1, 6)
     assert not hear(1, 7, held=False)
     assert hear(2, 1)
@@ -409,14 +420,14 @@ def test_of_two_holders_either_release_stops(first: int) -> None:
     other = 3 - first
     assert switch.hear(1, 0)
     assert switch.hear(2, 0)
-    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
+    assert switch.switch.pop_order(stand(Mode.RUN, LifeReason.ALIGNED)) == ""
     assert not switch.hear(first, 1, held=False)
     assert not switch.hear(other, 1)  # it still holds
-    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert switch.switch.pop_order(stand(Mode.RUN, LifeReason.ALIGNED)) == "released"
     assert not switch.hear(other, 2)
     assert not switch.hear(other, 3, held=False)
     assert switch.hear(other, 4)
-    assert switch.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    assert switch.switch.pop_order(stand(Mode.STOPPED, LifeReason.RELEASED)) == "held"
 
 
 def test_of_two_holders_either_silence_stops() -> None:
@@ -428,14 +439,14 @@ def test_of_two_holders_either_silence_stops() -> None:
     for n in range(4):
         assert switch.hear(2, n, after_ns=SWITCH_SILENCE_NS // 4)
     assert not switch.hear(2, 4, after_ns=1)
-    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert switch.switch.pop_order(stand(Mode.RUN, LifeReason.ALIGNED)) == "released"
     assert not switch.hear(2, 5)
     assert not switch.hear(2, 6, held=False)
     assert switch.hear(2, 7)
     assert not switch.hear(2, 8, held=False)
     assert switch.hear(2, 9)
-    assert switch.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert switch.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    assert switch.switch.pop_order(stand(Mode.RUN, LifeReason.ALIGNED)) == "released"
+    assert switch.switch.pop_order(stand(Mode.STOPPED, LifeReason.RELEASED)) == "held"
 
 
 def test_idle_switch_programs_displace_no_holder() -> None:

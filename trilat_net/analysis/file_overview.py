@@ -37,7 +37,7 @@ from ..log import (
 )
 from ..records import NS_PER_S
 from ..results import JsonObject, Result, finite_or_none
-from ..scenario import END_WINDOW_S, list_arm_notes
+from ..scenario import END_WINDOW_S
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
     ClockSummary,
@@ -390,7 +390,7 @@ def _describe_session(log: Log) -> JsonObject:
             "duration_s": scenario.duration_s,
             "seed": scenario.seed,
             "sites": list(log.sites),
-            "arms": list_arm_notes(scenario),
+            "arms": scenario.list_arm_notes(),
         },
         **{key: session.get(key) for key in _PROVENANCE},
         "versions": versions,
@@ -571,7 +571,7 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             },
             "dominance": scenario.dominance,
             "assumed": list(scenario.assumed),
-            "arms": list_arm_notes(scenario),
+            "arms": scenario.list_arm_notes(),
         },
         "session": {
             **log.session,

@@ -751,7 +751,7 @@ def _find_coasting_joints(
     site_specs = [scenario.sites[scenario.names[site]] for site in group]
     free_laws = []
     for spec in site_specs:
-        actors = [source.actor for source in (*spec.hands, *spec.environment)]
+        actors = spec.actors
         if not any(actor.start_s <= end_s < actor.end_s for actor in actors):
             free_laws.append(spec.control)
 

@@ -124,8 +124,7 @@ class RunView:
         """
         walls = {}
         for site in self.log.sites:
-            spec = self.scenario.sites[site]
-            for number, wall in enumerate(VirtualWall.list_of_site(spec), 1):
+            for number, wall in enumerate(VirtualWall.list_of_site(self.scenario, site), 1):
                 walls[f"{site}/{number}"] = (site, wall)
         return walls
 

@@ -14,15 +14,14 @@ Invariant:
       recorded torque agrees with it.
 """
 
-from collections.abc import Iterable
-from itertools import chain
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ..core import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, Array, TorqueKind, TorqueSource
 from ..log import Log
-from ..scenario import Scenario, SiteSpec
+from ..scenario import Scenario
 from .aligned import AlignedRecords, Bools
 from .arm_rows import EndEffectorRows, build_arm_rows
 from .row_reductions import sum_rows
@@ -51,13 +50,14 @@ class VirtualWall:
         self.may_generate_energy = source.sampled and any(source.K)
 
     @classmethod
-    def list_of_site(cls, spec: SiteSpec) -> list["VirtualWall"]:
+    def list_of_site(cls, scenario: Scenario, site: str) -> list["VirtualWall"]:
         """Lists the walls that the end effector of a site may touch, in scenario order.
 
         Args:
-            spec: Description of the site.
+            scenario: The scenario.
+            site: Name of the site.
         """
-        actors = [source.actor for source in spec.environment]
+        actors = [source.actor for source in scenario.sites[site].environment]
         return [cls(actor) for actor in actors if actor.kind is TorqueKind.WALL]
 
     def find_depth(self, end_effector: EndEffectorRows) -> Array:
@@ -548,8 +548,10 @@ class WallEnergy(NamedTuple):
         Args:
             scenario: The scenario.
         """
-        walls = map(VirtualWall.list_of_site, scenario.sites.values())
-        return sum(wall.may_generate_energy for wall in chain.from_iterable(walls))
+        walls = [
+            wall for site in scenario.names for wall in VirtualWall.list_of_site(scenario, site)
+        ]
+        return sum(wall.may_generate_energy for wall in walls)
 
     @classmethod
     def list_of_log(cls, log: Log) -> list["WallEnergy"]:
@@ -567,10 +569,10 @@ class WallEnergy(NamedTuple):
         """
         energies = []
         for site, records in AlignedRecords.by_site(log).items():
-            spec = log.scenario.sites[site]
             arm = build_arm_rows(log.scenario, site)
             end_effector = arm.place_end_effector(records.q, records.qd)
-            for wall in VirtualWall.list_of_site(spec):
+            sources = [source.actor for source in log.scenario.sites[site].environment]
+            for wall in VirtualWall.list_of_site(log.scenario, site):
                 if not wall.may_generate_energy:
                     continue
                 force = wall.find_force(records.nominal_s, end_effector)
@@ -587,7 +589,7 @@ class WallEnergy(NamedTuple):
                     site=site,
                     generated_j=generated_j,
                     required_damping_n_s_m=spring_share + wall.source.B[0],
-                    arm_damping_n_s_m=_find_arm_damping(spec, wall, contact_J, contact_s),
+                    arm_damping_n_s_m=_find_arm_damping(sources, wall, contact_J, contact_s),
                 )
                 energies.append(energy)
         return energies
@@ -625,7 +627,7 @@ def _find_generated_energy(
 
 
 def _find_arm_damping(
-    spec: SiteSpec,
+    sources: Sequence[TorqueSource],
     wall: VirtualWall,
     J: Array,
     t_s: Array,
@@ -636,18 +638,17 @@ def _find_arm_damping(
     the joints. Only dampers that act continuously are included.
 
     Args:
-        spec: Site of the wall.
+        sources: Torque sources of the environment of the wall's site.
         wall: The wall.
         J: Jacobian of the rows in contact, shape (K, m, n).
         t_s: Times of the rows in contact, shape (K,), in s.
     """
     damping_gains = []
-    for source in spec.environment:
-        actor = source.actor
-        is_damper = actor.kind is TorqueKind.VISCOUS and not actor.sampled
-        acts_in_all_rows = actor.start_s <= t_s[0] and actor.end_s > t_s[-1]
+    for source in sources:
+        is_damper = source.kind is TorqueKind.VISCOUS and not source.sampled
+        acts_in_all_rows = source.start_s <= t_s[0] and source.end_s > t_s[-1]
         if is_damper and acts_in_all_rows:
-            damping_gains.append(actor.B)
+            damping_gains.append(source.B)
     joint_damping = np.zeros(J.shape[2])
     for B in damping_gains:
         joint_damping = joint_damping + np.array(B)

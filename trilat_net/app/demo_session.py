@@ -18,6 +18,7 @@ Invariant:
       this process, which then ends the children in the right order.
 """
 
+import gc
 import os
 import signal
 import subprocess
@@ -40,7 +41,6 @@ from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
 from trilat_net.net import topics
-from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.signals import Interrupt
 
@@ -49,7 +49,6 @@ from ..files import refuse_link
 from ..log import Log, open_log
 from ..net import Clock, Connection, DefaultEndpoints, SystemClock
 from ..records import NS_PER_S
-from ..scenario import HandSite, check_outside_arms
 from .machine_load import check_machine_load
 from .monitor import SessionDisplay, SessionMonitor
 
@@ -239,7 +238,7 @@ class ProcessStarter:
     ) -> None:
         """Sends a request to the starter: a start if `number` is 0, otherwise a signal.
 
-        The starter is the process that starts the processes of the session as its copies.
+        The starter creates the processes of the session as forks of itself.
 
         Args:
             name: Name of the process.
@@ -325,8 +324,8 @@ def run_demo(
         UsageError: The scenario has an operator that runs as a separate program, and the
             package trilat-people is missing.
     """
-    check_outside_arms(scenario)
-    if any(_needs_hand_process(scenario, name) for name in scenario.names):
+    scenario.check_outside_arms()
+    if any(spec.needs_hand_process for spec in scenario.sites.values()):
         # A missing package is reported now, and not by a process in the middle of the start.
         load_entry(COMMANDS, "hand", "trilat hand")
     result = SessionResult(folder / "run.mcap")
@@ -464,7 +463,7 @@ def _start(
         ]
         processes.append(starter.start(name, arguments))
     for index, name in enumerate(scenario.names):
-        if _needs_hand_process(scenario, name):
+        if scenario.sites[name].needs_hand_process:
             arguments = [
                 "hand",
                 name,
@@ -487,23 +486,11 @@ def _start(
     return starter, processes, start_recorder
 
 
-def _needs_hand_process(scenario: Scenario, site: str) -> bool:
-    """Returns True if an arm is moved by a user's program that needs a process of its own.
-
-    A slow program then cannot delay the control loop of the arm.
-
-    Args:
-        scenario: The scenario.
-        site: Name of the site.
-    """
-    own_hand = HandSite.find(scenario, site)
-    return own_hand is not None and own_hand.has_separate_process
-
-
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
     """Returns True if the session is over: a process has failed, or all processes have ended.
 
-    If one process fails, the others are not left running.
+    After the failure of one process, the session ends, so that the other processes do not keep
+    running.
 
     Args:
         children: The processes.
@@ -633,7 +620,10 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
         sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
         for name in sites_by_counts.values():
             warm_up(scenario, name)
-    freeze_gc()
+    # Collections in the forked copies then skip the objects that exist now, and the memory of
+    # these objects stays shared.
+    gc.collect()
+    gc.freeze()
     # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
     # is delivered as soon as the copy has one.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

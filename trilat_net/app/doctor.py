@@ -29,7 +29,6 @@ from typing import Any, Literal, NamedTuple
 from sites import rehearse_loop, warm_up
 from trilat_net import workers
 from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
-from trilat_net.files import read_foreign_permissions
 from trilat_net.results import Result
 from trilat_net.scenario import load_scenario
 
@@ -99,11 +98,12 @@ def _examine_listening(
 ) -> DoctorFinding:
     """Checks whether this machine can listen at a network endpoint, by listening for a moment.
 
-    The port may be in use already. An unprotected endpoint causes a warning.
+    The check fails if, for example, another program uses the port. An unprotected endpoint
+    causes a warning.
 
     Args:
         endpoint: The endpoint, such as "tls/0.0.0.0:7447".
-        address: Its host and port.
+        address: Host and port of the endpoint.
         is_protected: True if the endpoint is encrypted or can only be reached from this
             machine.
     """
@@ -237,7 +237,7 @@ def _split_address(endpoint: str) -> tuple[str, int] | None:
 
 
 def _run_in_process(code: str) -> Any:
-    """Runs Python code in a new process, and returns the value that it prints.
+    """Runs Python code in a new process, and returns the value that the code prints.
 
     Some checks change the settings of their process, and must therefore not run in this
     process.
@@ -382,8 +382,7 @@ class MachineExamination:
         Yields:
             The findings about the keys.
         """
-        folder = self._keys_folder
-        if folder is None:
+        if self._keys_folder is None:
             yield DoctorFinding(
                 "keys",
                 "ok",
@@ -410,19 +409,8 @@ class MachineExamination:
         else:
             yield DoctorFinding("keys", "ok", description)
 
-        if read_foreign_permissions(folder):
-            yield DoctorFinding(
-                "keys", "warn", f"other users can read {folder}; run: chmod 700 {folder}"
-            )
-
-        # Anybody who has the key of the authority could create keys for further members.
-        authority = folder.resolve().parent / "authority" / PRIVATE_KEY
-        if authority.exists():
-            description = (
-                f"the authority's key {authority} should not be on this machine, because it "
-                "can create keys for anybody; keep it elsewhere"
-            )
-            yield DoctorFinding("keys", "warn", description)
+        for risk in member_keys.list_risks():
+            yield DoctorFinding("keys", "warn", risk)
 
     def check_links(self) -> Iterator[DoctorFinding]:
         """Checks whether each network endpoint can be opened or reached, and is encrypted.
@@ -682,7 +670,7 @@ class MachineExamination:
             yield DoctorFinding("core", "warn", text)
 
     def _secure_connection(self) -> Connection:
-        """Returns the endpoints with the member's keys.
+        """Returns the connection of this member with the member's keys.
 
         Raises:
             UsageError: The endpoints are open to other machines without keys.

@@ -131,13 +131,13 @@ class NearEnd:
         )
 
     def _send(self, size_bytes: int) -> None:
-        """Sends the next message, filled up with zeros to its size."""
+        """Sends the next message, padded with zeros to a given size in bytes."""
         sample = _HEADER.pack(self._owner, self._number, self._clock.monotonic_ns(), 0)
         self._number += 1
         self._put(sample.ljust(size_bytes, b"\0"))
 
     def _read_replies(self) -> Iterator[tuple[int, int]]:
-        """Yields number and round trip time, in ns, of each test message that has come back.
+        """Yields the number and the round-trip time in ns of each returned test message.
 
         Replies to other measuring processes are ignored.
         """
@@ -185,7 +185,7 @@ class NearEnd:
         first_number = self._number
 
         def count_missing() -> int:
-            """Stores the round-trip times of newly returned messages, and counts the rest.
+            """Stores round-trip times of newly returned messages, and counts missing messages.
 
             Replies to messages of earlier measurements are ignored.
 

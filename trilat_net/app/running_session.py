@@ -65,7 +65,7 @@ SOURCE = "the operator"
 
 
 def _never_stopped() -> bool:
-    """Returns False. It is the function `stopped` for calls that only a time limit ends."""
+    """Returns False: the argument `stopped` of calls that end only after a time limit."""
     return False
 
 
@@ -218,19 +218,12 @@ class RunningSession:
                 bus, site, scenario, source=type(device).__name__, repeats=False
             ) as hand,
         ):
-            live = scenario.sites[site].find_live_hand(is_open=True)
-            if live is None or live.mode != "tip":
-                raise UsageError(
-                    "a device can lead only an end effector: "
-                    f"the hand of {site} must have the mode 'tip'"
-                )
-
             device_hand = make_device_hand(
                 hand=hand,
                 device=device,
-                operator=live,
+                scenario=scenario,
+                site=site,
                 clock=self._clock,
-                reach=scenario.arms[site].reach,
             )
             device_hand.run(stopped, lambda text: say(f"{site}: {text}"))
             say(f"{site}: {device_hand.describe()}")
@@ -778,7 +771,7 @@ def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
 
 
 def _list_present(scenario: Scenario, infos: dict[str, Info]) -> list[str]:
-    """Lists the arms' processes that a request to all arms addresses.
+    """Lists the sites to which a request to all arms is sent.
 
     These are all sites of the scenario. If the scenario allows sites to leave, they are only
     the running sites, as long as at least one site runs.

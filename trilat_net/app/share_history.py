@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from trilat_net.errors import ScenarioError
 
-from ..scenario import Scenario, parse_core_change
+from ..scenario import Scenario
 
 
 class ShareHistory:
@@ -38,7 +38,7 @@ class ShareHistory:
             change: Description of the change, from the field `command` of the event.
         """
         with suppress(ScenarioError):  # raised if the text is not a change
-            ramp = parse_core_change(self._scenario, self._site, change).ramp
+            ramp = self._scenario.parse_core_change(self._site, change).ramp
             # A ramp that starts before the present ramp was added earlier, from another event.
             if ramp is not None and ramp.start_ns >= self._ramp.start_ns:
                 self._later_ramps.append(ramp)

@@ -26,7 +26,6 @@ __all__ = [
     "CoreChange",
     "DominanceRamp",
     "LifeAlarm",
-    "LifeReason",
     "PlantState",
     "TickInput",
     "describe_mode",
@@ -193,7 +192,6 @@ if TYPE_CHECKING:
         CoreChange,
         DominanceRamp,
         LifeAlarm,
-        LifeReason,
         PlantState,
         TickInput,
         describe_mode,
@@ -247,8 +245,8 @@ else:
             ),
             "step.site_step": "Site",
             "step.ticks": (
-                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm LifeReason MAX_ARRIVALS "
-                "PlantState RELEASE_REASONS TickInput describe_mode first_tick_at tick_ns"
+                "BUCKETS_PER_S CoreChange DominanceRamp LifeAlarm MAX_ARRIVALS PlantState "
+                "RELEASE_REASONS TickInput describe_mode first_tick_at tick_ns"
             ),
             "step.vectors": "Array IntArray Pair Points Vector",
         },

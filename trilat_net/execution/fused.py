@@ -50,12 +50,15 @@ class FusedRun(CompiledRun):
             act as operators, because their actions are part of the inputs.
         hands: Mapping from site to live operator. They replace the programs named in the
             scenario.
-        plants: Mapping from site to the user's program that moves its external arm.
+        runs_plants: If True, users' programs move the external arms for which the scenario
+            names such a program. Otherwise, a scenario with an external arm is rejected.
 
     Attributes:
         scenario: The scenario.
+        plants: Mapping from site name to the program that moves its arm.
 
     Raises:
+        CodeWithheld: The class of a program may not run.
         ScenarioError: The loop cannot execute the scenario, see `check_scenario`, or a law
             cannot be created.
     """
@@ -67,8 +70,9 @@ class FusedRun(CompiledRun):
         keep: int = 0,
         inputs: RunInputs | None = None,
         hands: Mapping[str, HandPlayer] = {},
-        plants: Mapping[str, PlantPlayer] = {},
+        runs_plants: bool = False,
     ) -> None:
+        plants = PlantPlayer.make_all(scenario) if runs_plants else {}
         self.check_scenario(scenario, plants)
         names = scenario.names
         setups = [scenario.setup(name) for name in names]
@@ -90,6 +94,7 @@ class FusedRun(CompiledRun):
             plants={i: plants[name] for i, name in enumerate(names) if name in plants},
         )
         self.scenario = scenario
+        self.plants = plants
 
     @staticmethod
     def check_scenario(scenario: Scenario, plants: Collection[str] = ()) -> None:

@@ -47,12 +47,11 @@ from ..log import (
     Progress,
     RecordsByTick,
     SiteLog,
+    count_skipped_ticks,
     open_log,
 )
 from ..net import MODE_WORDS, STATE_VECTORS, State
-from ..recorded_change import count_skipped_ticks
 from ..records import TickRecord
-from ..scenario import parse_core_change
 from .recorded_rows import LEAST_ROWS, PlainRows, SampleTable
 from .resumption import ArrivalEntry, RecordedInputs
 
@@ -790,7 +789,7 @@ class _SiteVerifier:
         changes: list[CoreChange] = []
         for change_tick, text in self._inputs.pop_changes(tick):
             try:
-                changes.append(parse_core_change(self._scenario, self._log.name, text))
+                changes.append(self._scenario.parse_core_change(self._log.name, text))
             except ScenarioError:
                 difference = RecordDifference(
                     site=self._log.name,

@@ -44,6 +44,7 @@ from ..log import (
     Sink,
     collect_provenance,
     compute_virtual_boot,
+    count_skipped_ticks,
 )
 from ..net import (
     SENT_TIME_SINCE,
@@ -59,7 +60,6 @@ from ..net import (
     topics,
 )
 from ..own_code import ImportedLaw
-from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Arrival, Mode, TickRecord
 from ..scenario import POLICY, HandPlayer, PlantPlayer, Scenario
 from .resumption import select_peer_channels

@@ -27,22 +27,13 @@ __all__ = [
     "convert_sends",
     # Conditions of stability
     "COMMON_MOTION_SHARE",
-    "ArmLoad",
     "BlockKey",
     "LawSituation",
     "LinearForm",
-    "StabilityCondition",
 ]
 
 if TYPE_CHECKING:
-    from .conditions import (
-        COMMON_MOTION_SHARE,
-        ArmLoad,
-        BlockKey,
-        LawSituation,
-        LinearForm,
-        StabilityCondition,
-    )
+    from .conditions import COMMON_MOTION_SHARE, BlockKey, LawSituation, LinearForm
     from .interface import (
         DAMPING,
         ERROR_DAMPING,
@@ -57,10 +48,7 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "conditions": (
-                "ArmLoad BlockKey COMMON_MOTION_SHARE LawSituation LinearForm "
-                "StabilityCondition"
-            ),
+            "conditions": "BlockKey COMMON_MOTION_SHARE LawSituation LinearForm",
             "interface": (
                 "ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun TuningSite"
             ),

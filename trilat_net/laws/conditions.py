@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import Array, DominanceMatrix
+from ..core import SCRIPTED_KINDS, Array, DominanceMatrix, TorqueKind, TorqueSource
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
 """Premise of every law with an energy account, as part of a sentence."""
@@ -43,6 +43,38 @@ class ArmLoad(NamedTuple):
     stiffness_nm_rad: tuple[float, ...]
     damping_nm_s_rad: tuple[float, ...]
 
+    @staticmethod
+    def list_of_actors(
+        actors: Sequence[TorqueSource], joints: int
+    ) -> "tuple[ArmLoad, ...] | None":
+        """Returns the spring and the damper of each actor that reacts to the motion of an arm.
+
+        Excludes actors whose torque depends on time alone.
+
+        Args:
+            actors: Operators and environments of the arm.
+            joints: Number of joints of the arm.
+
+        Returns:
+            The springs and dampers. None if the reaction of an actor depends on the pose
+            (because an operator acts on the end effector), or is unknown (for a live operator
+            or a program).
+        """
+        loads = []
+        for actor in actors:
+            if actor.kind in SCRIPTED_KINDS:
+                continue
+            # A sampled torque lags behind the motion, so it is not that of a spring and damper.
+            if actor.kind not in (TorqueKind.HAND, TorqueKind.VISCOUS) or actor.sampled:
+                return None
+            stiffness = actor.K or (0.0,)
+            load = ArmLoad(
+                stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
+                damping_nm_s_rad=tuple(np.broadcast_to(actor.B, joints).tolist()),
+            )
+            loads.append(load)
+        return tuple(loads)
+
 
 class LawSituation(NamedTuple):
     """Facts needed to evaluate a stability condition: laws, delays and weights of all arms.
@@ -63,9 +95,9 @@ class LawSituation(NamedTuple):
             chain.
         hold_s: Duration for which a torque is held, s: one tick with the scheme `digital`, NaN
             if tick rates differ between sites, otherwise 0 as in continuous time.
-        hands: For each site, the operators and environments that react to the motion of its
-            arm. None for a site where one of these reactions is not a spring and a damper per
-            joint. () if nothing is known about any site.
+        actors: For each site, the operators and environments of its arm. () if nothing is known
+            about any site.
+        joints: Number of joints of each arm.
         in_task_space: True if end effectors rather than joints follow each other.
     """
 
@@ -78,7 +110,8 @@ class LawSituation(NamedTuple):
     rate_hz: int
     gravity_nm: tuple[float, ...] = ()
     hold_s: float = 0.0
-    hands: tuple[tuple[ArmLoad, ...] | None, ...] = ()
+    actors: tuple[tuple[TorqueSource, ...], ...] = ()
+    joints: tuple[int, ...] = ()
     in_task_space: bool = False
 
     @property
@@ -107,8 +140,20 @@ class LawSituation(NamedTuple):
             laws=tuple(self.laws[n] for n in sites),
             alpha=self.alpha[submatrix],
             delay_s=self.delay_s[submatrix],
-            hands=tuple(self.hands[n] for n in sites) if self.hands else (),
+            actors=tuple(self.actors[n] for n in sites) if self.actors else (),
+            joints=tuple(self.joints[n] for n in sites) if self.joints else (),
         )
+
+    def list_loads(self) -> list[tuple[ArmLoad, ...] | None]:
+        """Returns the springs and dampers that react to the motion of each arm.
+
+        None for an arm with another reaction, see `ArmLoad.list_of_actors`, and for all arms if
+        nothing is known about any of them.
+        """
+        if not self.actors:
+            return [None] * len(self.laws)
+        pairs = zip(self.actors, self.joints, strict=True)
+        return [ArmLoad.list_of_actors(actors, joints) for actors, joints in pairs]
 
     def judge_position_exchange(self, damping: str) -> "StabilityCondition | None":
         """Evaluates whether arms coupled by springs and braked by dampers are stable.

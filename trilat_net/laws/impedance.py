@@ -237,7 +237,7 @@ class Impedance(ControlLaw):
             return StabilityCondition(False, text)
 
         slave = followers[0]
-        hands = situation.hands or (None,) * len(laws)
+        hands = situation.list_loads()
         slave_loads = hands[slave]
         if slave_loads == ():
             text = "the slave touches nothing, so no loop is closed, whatever the delays"
@@ -491,8 +491,7 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
         situation: All sites, their laws and their hands.
         slave: Index of the slave.
     """
-    hands = situation.hands or (None,) * len(situation.laws)
-    selections = _select_master_hands(hands, slave)
+    selections = _select_master_hands(situation.list_loads(), slave)
     if selections is None:
         return "no bound is known for walls, because of the hands at the masters"
     factors = situation.alpha[slave]

@@ -69,6 +69,7 @@ __all__ = [
     "RecoverySurvey",
     "StartGap",
     "check_file",
+    "count_skipped_ticks",
     "create_signing_keys",
     "describe_unknown_ends",
     "recover",
@@ -88,6 +89,7 @@ if TYPE_CHECKING:
         Account,
         Coverage,
         StartGap,
+        count_skipped_ticks,
         describe_unknown_ends,
     )
     from .data_tables import UNIT_SUFFIXES, Column, Table
@@ -141,7 +143,10 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "accounting": "Account Coverage LAST MIN_COVERAGE StartGap describe_unknown_ends",
+            "accounting": (
+                "Account Coverage LAST MIN_COVERAGE StartGap count_skipped_ticks "
+                "describe_unknown_ends"
+            ),
             "data_tables": "Column Table UNIT_SUFFIXES",
             "findings": "CheckReport Finding",
             "log_file": "LogFile",

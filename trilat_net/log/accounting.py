@@ -21,11 +21,15 @@ import math
 import re
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import islice
 from typing import NamedTuple
 
+import msgspec
+
 from ..errors import count_nouns
 from ..net import count_messages, number_message
+from ..recorded_change import RecordedChange
 
 
 class RangeSet:
@@ -614,3 +618,20 @@ LAST = "last"
 """Kind of the event in which a site states how many ticks of a peer it had received before the
 peer was restarted.
 """
+
+
+def count_skipped_ticks(texts: Sequence[str]) -> int:
+    """Returns how many ticks an arm missed just before a record.
+
+    Ticks are missed if the control loop is too late. A record contains the changes applied in
+    its tick, including those that report missed ticks.
+
+    Args:
+        texts: Changes in the record, as JSON strings. Invalid strings are ignored.
+    """
+    skipped = 0
+    for text in texts:
+        if "overrun" in text:
+            with suppress(msgspec.MsgspecError):
+                skipped += msgspec.json.decode(text, type=RecordedChange).ticks
+    return skipped

@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 from ..core import tick_ns
 from ..errors import WireError
 from ..net import MODES, READABLE, Event, LinkStats, State, decode, number_message, topics
-from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
+from .accounting import count_skipped_ticks
 from .log_layout import CHANNEL_TYPES, MAX_TIME_NS, RECORDER_CHANNELS, SITE_CHANNELS, VIZ_ROOT
 from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_records
 from .message_identity import AnyMessage, MessageIdentity, compute_virtual_boot

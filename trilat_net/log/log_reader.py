@@ -60,7 +60,6 @@ from ..scenario import (
     PictureDelay,
     Scenario,
     TracePoint,
-    parse_core_change,
     parse_embedded,
 )
 from .accounting import LAST, Account, describe_unknown_ends
@@ -940,7 +939,7 @@ class Log(Result, Mapping[str, SiteLog]):
         commands = {}
         try:
             for tick, texts in self.changes(site).items():
-                changes = [parse_core_change(self.scenario, site, text) for text in texts]
+                changes = [self.scenario.parse_core_change(site, text) for text in texts]
                 commands[tick] = changes
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None

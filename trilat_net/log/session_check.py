@@ -22,10 +22,9 @@ from typing import Any, BinaryIO
 from ..errors import LogError, ScenarioError, WireError, count_nouns
 from ..files import open_regular
 from ..net import decode, messages, topics
-from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S
 from ..scenario import Scenario, parse_embedded
-from .accounting import Account, describe_unknown_ends
+from .accounting import Account, count_skipped_ticks, describe_unknown_ends
 from .findings import CheckReport, Finding, Findings
 from .log_layout import (
     ACCOUNTS,

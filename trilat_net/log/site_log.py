@@ -25,9 +25,9 @@ from ..core import MAX_DELAY_US, POSE, POSITION, Array, LawChannel
 from ..errors import LogError, WireError, count_nouns
 from ..hooks import find_hook
 from ..net import READABLE, State, decode
-from ..recorded_change import count_skipped_ticks
 from ..records import NS_PER_S, Layout
 from ..scenario import TracePoint
+from .accounting import count_skipped_ticks
 from .orientations import RotationVectors, align_signs
 from .packed.indexed_records import IndexedRecords
 from .packed.packed_messages import PackedMessages

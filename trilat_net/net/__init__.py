@@ -46,6 +46,7 @@ __all__ = [
     "PRIVATE_KEY",
     "add_keys",
     "create_keys",
+    "read_foreign_permissions",
     "read_member_keys",
     "renew_keys",
     # Messages and their encoding
@@ -67,6 +68,7 @@ __all__ = [
     "ArmMeasurement",
     "Backfill",
     "BackfillRequest",
+    "ChangeQuery",
     "ChangeReply",
     "ChangeRequest",
     "Event",
@@ -147,6 +149,7 @@ if TYPE_CHECKING:
         PRIVATE_KEY,
         add_keys,
         create_keys,
+        read_foreign_permissions,
         read_member_keys,
         renew_keys,
     )
@@ -196,7 +199,7 @@ if TYPE_CHECKING:
         PeerSeen,
     )
     from .session import SessionJoin
-    from .session_members import REPLY_TIMEOUT_S, SessionMembers
+    from .session_members import REPLY_TIMEOUT_S, ChangeQuery, SessionMembers
     from .site_stand_in import SiteStandIn
     from .timing import LinkTimingMonitor, LoopStats, PeerClock, SiteTiming, find_turn_ns
     from .topics import (
@@ -233,7 +236,7 @@ else:
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
                 "AUTHORITY CERTIFICATE HERE MEMBERS PRIVATE_KEY add_keys create_keys "
-                "read_member_keys renew_keys"
+                "read_foreign_permissions read_member_keys renew_keys"
             ),
             "membership": (
                 "Epoch EventPublisher LateSites describe_member new_boot read_messages"
@@ -251,7 +254,7 @@ else:
                 "OrderName PeerSeen"
             ),
             "session": "SessionJoin",
-            "session_members": "REPLY_TIMEOUT_S SessionMembers",
+            "session_members": "ChangeQuery REPLY_TIMEOUT_S SessionMembers",
             "site_stand_in": "SiteStandIn",
             "timing": "LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns",
             "topics": (

@@ -25,7 +25,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +40,6 @@ from ..files import (
     describe_write_error,
     make_folder,
     open_regular,
-    read_foreign_permissions,
     stage_output,
     write_whole,
 )
@@ -88,6 +87,7 @@ class MemberKeys(NamedTuple):
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
         hosts: Names and addresses under which other members can reach this member. Connections
             to any other address fail.
+        folder: Folder that contains the keys.
     """
 
     member: str
@@ -95,6 +95,32 @@ class MemberKeys(NamedTuple):
     ends: datetime.datetime
     settings: dict[str, Any]
     hosts: tuple[str, ...] = ()
+    folder: Path = Path()
+
+    def list_risks(self) -> Iterator[str]:
+        """Yields who else could use the keys on this machine, and the remedy for each risk."""
+        if read_foreign_permissions(self.folder):
+            yield f"other users can read {self.folder}; run: chmod 700 {self.folder}"
+
+        # Anybody who has the key of the authority could create keys for further members.
+        authority = self.folder.resolve().parent / _AUTHORITY_FOLDER / PRIVATE_KEY
+        if authority.exists():
+            yield (
+                f"the authority's key {authority} should not be on this machine, because it "
+                "can create keys for anybody; keep it elsewhere"
+            )
+
+
+def read_foreign_permissions(path: Path) -> int:
+    """Returns the permission bits that a file grants to its group and to all other users.
+
+    A file that contains a secret should grant none. Returns 0 on Windows, which uses access
+    control lists instead.
+
+    Args:
+        path: The file.
+    """
+    return 0 if os.name == "nt" else path.stat().st_mode & 0o077
 
 
 def create_keys(
@@ -841,6 +867,7 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
         ends=ends,
         settings=_make_settings(folder.resolve(), members),
         hosts=_list_hosts(certificate),
+        folder=folder,
     )
 
 

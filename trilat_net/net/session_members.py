@@ -44,6 +44,60 @@ Sites try to connect every half second.
 """
 
 
+class ChangeQuery:
+    """A request for a change that was sent to a site, and whose reply is awaited.
+
+    Args:
+        bus: Network connection through which the site can be reached.
+        clock: Clock of the caller.
+        session: Name of the session.
+        site: Name of the site.
+        request: The requested change, or a command such as "stop".
+    """
+
+    def __init__(
+        self, bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest
+    ) -> None:
+        self._bus = bus
+        self._clock = clock
+        channel = topics.STOP if request.order == "stop" else topics.SET
+        self._key = topics.key(session, site, channel)
+        self._send(request)
+
+    def _send(self, request: ChangeRequest) -> None:
+        """Sends the request, and starts to wait for its reply."""
+        self._request = request
+        self._replies = self._bus.query(self._key, encode(request))
+        self._sent_ns = self._clock.monotonic_ns()
+
+    @property
+    def is_overdue(self) -> bool:
+        """True if the site has not replied within `REPLY_TIMEOUT_S`."""
+        return self._clock.monotonic_ns() - self._sent_ns >= REPLY_TIMEOUT_S * 1e9
+
+    def poll(self) -> ChangeReply | None:
+        """Returns the reply of the site, which accepts or rejects the request.
+
+        Returns:
+            The reply. None while it has not arrived.
+
+        Raises:
+            WireError: The reply cannot be decoded.
+        """
+        arrived = self._replies.poll()
+        if arrived is None:
+            return None
+        _, payload = arrived
+        reply = decode(payload, ChangeReply)
+        request = self._request
+        if request.order == "stop" and not reply.accepted and request.source is not UNSET:
+            # A site with an older version of this program does not know the field `source`, and
+            # refuses the whole request. Its arm must stop as well.
+            self._send(msgspec.structs.replace(request, source=UNSET))
+            return None
+        return reply
+
+
 class SessionMembers:
     """Queries the members of a running session over an open connection.
 
@@ -142,25 +196,21 @@ class SessionMembers:
         Raises:
             SessionError: The site does not reply.
         """
-        channel = topics.STOP if request.order == "stop" else topics.SET
-        payload = self._query_once(topics.key(self._session, site, channel), request)
-        if payload is None:
-            hint = "; in a session with keys, only the operator may request changes"
-            raise SessionError(
-                f"{site} did not answer; the records of {site} show whether the change was made"
-                f"{'' if channel == topics.STOP else hint}"
-            )
+        query = ChangeQuery(self._bus, self._clock, self._session, site, request)
+        while not query.is_overdue:
+            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+            try:
+                reply = query.poll()
+            except WireError as error:
+                raise SessionError(f"the reply of {site} cannot be read: {error}") from None
+            if reply is not None:
+                return reply
 
-        try:
-            reply = decode(payload, ChangeReply)
-        except WireError as error:
-            raise SessionError(f"the reply of {site} cannot be read: {error}") from None
-
-        if request.order == "stop" and not reply.accepted and request.source is not UNSET:
-            # A site with an older version of this program does not know the field `source`, and
-            # refuses the whole request. Its arm must stop as well.
-            return self.send_change(site, msgspec.structs.replace(request, source=UNSET))
-        return reply
+        hint = "; in a session with keys, only the operator may request changes"
+        raise SessionError(
+            f"{site} did not answer; the records of {site} show whether the change was made"
+            f"{'' if request.order == 'stop' else hint}"
+        )
 
     def list_past_events(
         self,

@@ -71,11 +71,11 @@ if TYPE_CHECKING:
     from .figures.registry import FIGURES, figure, write_figures, write_overlay
     from .foxglove_layout import write_foxglove_layout
     from .linear_text import describe_moving_states
+    from .network_text import compose_benchmark, compose_doctor, compose_ping
     from .observed_text import NEGATIVE_ENERGY_MEANING
     from .rerun_viewer import ViewerOptions, open_rerun
     from .result_text import MARKS, Block, MarkedText, TextTable, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
-    from .summary_text import compose_benchmark, compose_doctor, compose_ping
     from .terminal_output import err, print_error, print_json, print_line, print_table
     from .verdict_text import describe_energy_obstacle
 else:
@@ -92,11 +92,11 @@ else:
             "figures.registry": "FIGURES figure write_figures write_overlay",
             "foxglove_layout": "write_foxglove_layout",
             "linear_text": "describe_moving_states",
+            "network_text": "compose_benchmark compose_doctor compose_ping",
             "observed_text": "NEGATIVE_ENERGY_MEANING",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",
-            "summary_text": "compose_benchmark compose_doctor compose_ping",
             "terminal_output": (
                 "err print_error print_json print_line print_table terminal_output"
             ),

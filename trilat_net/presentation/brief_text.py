@@ -2,7 +2,7 @@
 
 The short output lets a reader see within seconds whether a run was stable and how well the arms
 followed each other. With the option --all, the commands print everything; see
-`certificate_text` and `summary_text`.
+`certificate_text` and `metrics_text`.
 
 Invariant:
     - A short text has at most `MOST_LINES` lines, plus one line that mentions --all. The

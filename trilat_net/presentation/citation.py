@@ -11,13 +11,11 @@ Invariant:
 
 from collections.abc import Iterator, Mapping
 
-import msgspec
-
 from ..analysis import Certificate, Stability
 from ..errors import count_nouns
 from ..files import find_version
 from ..log import Log, collect_provenance
-from ..scenario import Scenario, describe_value
+from ..scenario import Scenario
 
 _SOFTWARE = """@software{{trilat_net,
   title   = {{trilat-net}},
@@ -142,19 +140,16 @@ def _state_settings(scenario: Scenario) -> Iterator[str]:
     """
     law_texts = {}
     for name, site in scenario.sites.items():
-        control = site.control
-        gains = msgspec.structs.asdict(control)
         code_note = ""
 
         # The law is a user's Python class. Its hash tells which version of the file was used.
         user_law = site.user_law
         if user_law is not None:
-            gains = user_law.settings
             code_note = (
                 f", other settings as in its file (SHA-256 {user_law.source_sha256[:16]})"
             )
 
-        gains_text = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
+        gains_text = ", ".join(f"{key} {text}" for key, text in site.describe_gains().items())
         law_texts[name] = (
             f"{site.law_name} ({gains_text}){code_note}"
             if gains_text

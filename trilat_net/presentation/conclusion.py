@@ -32,9 +32,9 @@ from .certificate_text import (
     describe_in_words,
     describe_theorem,
 )
+from .log_text import format_run_lines
 from .plot_signals import shared_unit
 from .result_text import MARKS, Block, MarkedText, TextTable
-from .summary_text import format_run_lines
 
 
 @dataclass(frozen=True, repr=False)

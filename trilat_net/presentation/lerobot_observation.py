@@ -15,21 +15,25 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..analysis import build_arm_rows
-from ..core import Array
+from ..core import Array, TorqueSource
 from ..errors import UsageError
 from ..log import Ints, Log
-from ..scenario import TASK_AXES, LiveHand
+from ..scenario import TASK_AXES
 
 _HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
 """Kind of exported actions that an operator accepts as commands, keyed by operator mode."""
 
 
-def _find_plugin_hand(log: Log, site: str) -> LiveHand:
+def _find_plugin_hand(log: Log, site: str) -> tuple[str, TorqueSource]:
     """Finds the operator model through which a plugin's program moves an arm.
 
     Args:
         log: Log of the run.
         site: Name of the site.
+
+    Returns:
+        The mode of the operator: "tip", "joint" or "force". The torque source of the operator,
+        which has its stiffness, damping and limit.
 
     Raises:
         UsageError: The scenario does not allow a program to move the arm of this site.
@@ -41,7 +45,7 @@ def _find_plugin_hand(log: Log, site: str) -> LiveHand:
             f"{site}, which the scenario does not have; choose another user by site=NAME, or "
             "leave observations out"
         )
-    return hand
+    return hand.mode, hand.actor
 
 
 def find_plugin_actions(log: Log, site: str) -> str:
@@ -58,7 +62,7 @@ def find_plugin_actions(log: Log, site: str) -> str:
     Raises:
         UsageError: The operator of the site is commanded by forces, which are not exported.
     """
-    mode = _find_plugin_hand(log, site).mode
+    mode, _ = _find_plugin_hand(log, site)
     if mode not in _HAND_ACTIONS:
         raise UsageError(
             f"{log.source}: the operator of {site} is commanded by forces, which are not "
@@ -86,7 +90,7 @@ def observe_as_plugin(
     Raises:
         UsageError: The scenario has no operator for the plugin at this site.
     """
-    hand = _find_plugin_hand(log, site)
+    mode, source = _find_plugin_hand(log, site)
     columns: list[Array] = []
     names: list[str] = []
     for observed_site in (slave, site):
@@ -108,14 +112,14 @@ def observe_as_plugin(
     pose = records.q[site_rows]
     pose_rate = records.qd[site_rows]
     axes = tuple(log.scenario.arms[site].joint_names)
-    if hand.mode != "joint":
+    if mode != "joint":
         arm_rows = build_arm_rows(log.scenario, site)
         end_effector = arm_rows.place_end_effector(pose, pose_rate)
         pose = end_effector.position
         pose_rate = end_effector.speed
         axes = TASK_AXES[: pose.shape[1]]
 
-    force = _compute_pull(hand, records.hand[site_rows], pose, pose_rate)
+    force = _compute_pull(mode, source, records.hand[site_rows], pose, pose_rate)
     # The operator feels the reaction of the force that moves the arm.
     columns += [pose, -force]
     names += [f"{axis}.pos" for axis in axes]
@@ -123,7 +127,9 @@ def observe_as_plugin(
     return np.hstack(columns), names
 
 
-def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array) -> Array:
+def _compute_pull(
+    mode: str, source: TorqueSource, vectors: Array, pose: Array, pose_rate: Array
+) -> Array:
     """Computes the force of an operator model on its arm, as `Hand.force` does in a session.
 
     The operator is modelled as a spring and damper that pulls the arm towards a target. With
@@ -134,7 +140,8 @@ def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array)
     The norm of F is limited, and F is multiplied by the grip, a number from 0 to 1.
 
     Args:
-        hand: The operator.
+        mode: Mode of the operator.
+        source: Torque source of the operator.
         vectors: Field `hand` of the records (`HandInForce`), shape (F, 3 + 2 n).
         pose: Pose of the arm in the coordinates of the operator, shape (F, n).
         pose_rate: Time derivative of the pose, shape (F, n).
@@ -142,24 +149,23 @@ def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array)
     Returns:
         The force in N, or in mode `joint` the torques in N m, shape (F, n).
     """
-    settings = hand.actor
     coordinate_count = pose.shape[1]
     grip = vectors[:, :1]
     target = vectors[:, 3 : 3 + coordinate_count]
     target_rate = vectors[:, 3 + coordinate_count :]
 
     unlimited_force = target  # in mode `force`, the target is the force itself
-    if hand.mode != "force":
-        stiffness = np.array(settings.K)
-        damping = np.array(settings.B)
+    if mode != "force":
+        stiffness = np.array(source.K)
+        damping = np.array(source.B)
         spring_force = stiffness * (target - pose)
         damper_force = damping * (target_rate - pose_rate)
         unlimited_force = spring_force + damper_force
 
     magnitude = np.linalg.norm(unlimited_force, axis=1, keepdims=True)
-    is_above_limit = magnitude > settings.limit
+    is_above_limit = magnitude > source.limit
     scale = np.divide(
-        settings.limit, magnitude, out=np.ones_like(magnitude), where=is_above_limit
+        source.limit, magnitude, out=np.ones_like(magnitude), where=is_above_limit
     )
     force: Array = grip * scale * unlimited_force
     return force

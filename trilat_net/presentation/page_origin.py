@@ -19,7 +19,6 @@ from ..results import JsonObject
 from ..scenario import (
     Scenario,
     ScenarioDifference,
-    list_arm_notes,
     list_shipped,
     load_scenario,
 )
@@ -128,7 +127,7 @@ def _render_description(scenario: Scenario) -> Markup:
 
 def _render_assumptions(scenario: Scenario) -> Markup:
     """Renders the list of assumptions declared by the scenario, and the notes on its arms."""
-    texts = [*scenario.assumed, *list_arm_notes(scenario)]
+    texts = [*scenario.assumed, *scenario.list_arm_notes()]
     return render_macro("origin.html", "assumptions", texts=texts)
 
 

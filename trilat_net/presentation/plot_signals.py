@@ -50,25 +50,6 @@ def reference_angles(part: SiteLog) -> Array:
     return part.q if part.layout.task else part.q_des
 
 
-def joint_error_rates(part: SiteLog) -> Array:
-    """Returns the velocity error of an arm: its velocity minus that of its reference.
-
-    Args:
-        part: The K records of the arm.
-
-    Returns:
-        Velocity errors of the n joints, in rad/s, shape (K, n). If the arms follow each other's
-        end effectors, the velocity errors of the m task coordinates, shape (K, m).
-    """
-    if part.layout.task:
-        # in task space the column qd_des holds xd_des
-        velocity_error = part.xd - part.qd_des
-        followed_axes = np.array(part.axes)
-        rates: Array = velocity_error * followed_axes
-        return rates
-    return part.qd - part.qd_des
-
-
 def shared_unit(log: Log) -> str:
     """Returns the unit of the coordinates in which the arms follow each other.
 

@@ -232,14 +232,14 @@ Block = str | MarkedText | TextTable
 _COMPOSERS = {
     "Certificate": "certificate_text:compose_certificate",
     "LinearAnalysis": "linear_text:compose_linear",
-    "Log": "summary_text:compose_log",
-    "LogCheckReport": "summary_text:compose_verification",
-    "LogCheckResult": "summary_text:compose_log_check",
-    "LogMetrics": "summary_text:compose_metrics",
+    "Log": "log_text:compose_log",
+    "LogCheckReport": "log_text:compose_verification",
+    "LogCheckResult": "log_text:compose_log_check",
+    "LogMetrics": "metrics_text:compose_metrics",
     "FileOverview": "overview_tables:compose_overview",
-    "Recovery": "summary_text:compose_recovery",
+    "Recovery": "log_text:compose_recovery",
     "PushedTwins": "certificate_text:compose_twins",
-    "Rerun": "summary_text:compose_rerun",
+    "Rerun": "rerun_text:compose_rerun",
 }
 """Functions that compose the text of results, given as "module:function" and keyed by class
 name.

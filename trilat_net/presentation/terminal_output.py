@@ -338,10 +338,7 @@ def show_progress(
             yield show
         return
 
-    from ..net import SystemClock
-
-    clock = SystemClock()
-    first_call_ns = -1  # time of the first call of `show_line`, -1 before it
+    first_call_s: float | None = None  # time of the first call of `show_line`
     done_at_first_call = 0
     printed_tenths = 0  # tenths of the items that were finished at the last printed line
     last_total = 0
@@ -357,11 +354,12 @@ def show_progress(
             done: Number of finished items.
             total: Total number of items.
         """
-        nonlocal first_call_ns, done_at_first_call, printed_tenths, last_total
-        if first_call_ns < 0:
+        nonlocal first_call_s, done_at_first_call, printed_tenths, last_total
+        now_s = err.get_time()
+        if first_call_s is None:
             # The time before the first item is the start of the processes, which does not
             # count towards the duration of an item.
-            first_call_ns = clock.monotonic_ns()
+            first_call_s = now_s
             done_at_first_call = done
         finished_tenths = done * _RUN_LINES // total
         if total != last_total:
@@ -372,7 +370,7 @@ def show_progress(
             return
 
         printed_tenths = finished_tenths
-        elapsed_s = (clock.monotonic_ns() - first_call_ns) * 1e-9
+        elapsed_s = now_s - first_call_s
         remaining_s = elapsed_s / (done - done_at_first_call) * (total - done)
         print_line(f"  {done} of {total} {items}, about {format_wall_time(remaining_s)} left")
 

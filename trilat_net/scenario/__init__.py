@@ -18,7 +18,6 @@ __all__ = [
     "ExperimentText",
     "SimulatedArm",
     "TracePoint",
-    "check_outside_arms",
     "import_trace",
     "list_shipped",
     "load_scenario",
@@ -39,7 +38,6 @@ __all__ = [
     "ArmModel",
     "Change",
     "Scenario",
-    "SiteSpec",
     "check_finite",
     "is_distribution",
     "is_number",
@@ -48,6 +46,7 @@ __all__ = [
     "PictureDelay",
     # Operators and environments
     "FAILED_HAND",
+    "HAND_MODES",
     "POLICY",
     "HandPlayer",
     "HandSite",
@@ -57,7 +56,6 @@ __all__ = [
     "PlantPlayer",
     # Changes during a run
     "LinkTables",
-    "parse_core_change",
     "resolve_change",
     # Expectations
     "ALL_SITES_QUANTITIES",
@@ -70,7 +68,6 @@ __all__ = [
     "describe_scenario",
     "describe_value",
     "flatten_table",
-    "list_arm_notes",
 ]
 
 if TYPE_CHECKING:
@@ -83,21 +80,19 @@ if TYPE_CHECKING:
         ScenarioDifference,
         describe_law,
         describe_scenario,
-        describe_value,
         flatten_table,
-        list_arm_notes,
     )
     from .expect import ALL_SITES_QUANTITIES, END_WINDOW_S, Expect
     from .key_checks import check_finite, is_distribution, is_number
     from .laws import BUILT_IN, LAWS
     from .link_presets import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-    from .operators.kernel_operators import LiveHand
+    from .operators.kernel_operators import HAND_MODES, LiveHand
     from .operators.program_hand import FAILED_HAND, POLICY, HandPlayer, HandSite
     from .override import split_assignment
     from .own_plant import OwnPlant
     from .picture_delay import PictureDelay
     from .plant_player import PlantContext, PlantPlayer
-    from .run_changes import LinkTables, parse_core_change, resolve_change
+    from .run_changes import LinkTables, resolve_change
     from .scenario_reader import (
         ExperimentText,
         list_shipped,
@@ -108,9 +103,8 @@ if TYPE_CHECKING:
     )
     from .scenario_types import Scenario
     from .simulated_arm import SimulatedArm
-    from .site_spec import SiteSpec
     from .skeletons import name_skeleton_class, new_hand, new_law, new_plant
-    from .validate import check_outside_arms
+    from .value_text import describe_value
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -121,27 +115,26 @@ else:
             "delay_traces": "TracePoint import_trace",
             "describe": (
                 "IRREVERSIBLE_SHARES ScenarioDifference describe_law describe_scenario "
-                "describe_value flatten_table list_arm_notes"
+                "flatten_table"
             ),
             "expect": "ALL_SITES_QUANTITIES END_WINDOW_S Expect",
             "key_checks": "check_finite is_distribution is_number",
             "laws": "BUILT_IN LAWS",
             "link_presets": "GRID_LOSSES_PERCENT GRID_ROUND_TRIPS_MS",
-            "operators.kernel_operators": "LiveHand",
+            "operators.kernel_operators": "HAND_MODES LiveHand",
             "operators.program_hand": "FAILED_HAND HandPlayer HandSite POLICY",
             "override": "split_assignment",
             "own_plant": "OwnPlant",
             "picture_delay": "PictureDelay",
             "plant_player": "PlantContext PlantPlayer",
-            "run_changes": "LinkTables parse_core_change resolve_change",
+            "run_changes": "LinkTables resolve_change",
             "scenario_reader": (
                 "ExperimentText list_shipped load_scenario parse_embedded parse_scenario "
                 "read_template"
             ),
             "scenario_types": "Scenario",
             "simulated_arm": "SimulatedArm",
-            "site_spec": "SiteSpec",
             "skeletons": "name_skeleton_class new_hand new_law new_plant",
-            "validate": "check_outside_arms",
+            "value_text": "describe_value",
         },
     )

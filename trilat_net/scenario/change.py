@@ -13,8 +13,10 @@ from contextlib import suppress
 
 import msgspec
 
+from ..errors import ScenarioError
 from ..recorded_change import RecordedChange
 from .delay_models import Link, LinkBase
+from .refusals import refuse
 
 _ORDER_SENTENCES = {
     "stop": "{site} was stopped{by} at {at}",
@@ -62,6 +64,32 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
         their site.
         """
         return self.site or self.dominance or self.link.partition("->")[2]
+
+    def check_link(self, path: str) -> None:
+        """Raises ScenarioError if a link would have invalid settings after the change.
+
+        A change of anything but a link is accepted.
+
+        Args:
+            path: Path of the change in the scenario, for error messages.
+
+        Raises:
+            ScenarioError: A setting of the link is not valid, or the change of a link specifies
+                a transition time. The error contains the path of the key.
+        """
+        if not self.link:
+            return
+        if self.ramp_s:
+            raise ScenarioError(
+                "a link changes at once; only shares have a ramp", path=f"{path}.ramp_s"
+            )
+        try:
+            link = self.after
+        except msgspec.ValidationError as error:
+            raise refuse(error, self.to, Link, f"{path}.to") from None
+        problem = link.find_problem()
+        if problem is not None:
+            raise ScenarioError(problem.problem, path=f"{path}.to.{problem.key}")
 
     def describe(self, ordered_by: str = "") -> str:
         """Returns a human-readable phrase that describes the change.

@@ -25,11 +25,12 @@ from ..core import (
 )
 from ..errors import count_nouns
 from ..records import NS_PER_S
-from .arms import TASK_AXES, Arm
+from .arms import TASK_AXES
 from .rest_bounds import find_rest_bounds
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
 from .urdf import UrdfJoint
+from .value_text import describe_value
 
 # Notes on the matrix of dominance factors, the weights with which sites follow their peers.
 COUPLED_OPERATORS = (
@@ -178,7 +179,7 @@ def _describe_shares(scenario: Scenario) -> list[str]:
 def _describe_arms(scenario: Scenario) -> list[str]:
     """Returns lines about each distinct arm with a URDF file: its joints, limits and notes."""
     lines: list[str] = []
-    for arm, owners in _group_chains(scenario):
+    for arm, owners in scenario.group_chains():
         chain = arm.read_chain(scenario.urdf)
         model = scenario.arms[owners[0]]
         mass_kg = sum(joint.inertia[0] for joint in chain.joints)
@@ -191,7 +192,7 @@ def _describe_arms(scenario: Scenario) -> list[str]:
         for joint, drive in zip(chain.joints, model.chain.joints, strict=True):
             lines.append(_describe_joint(joint, drive))
         lines += [f"  note: {note}" for note in chain.notes]
-    return lines + [f"note: {note}" for note in _list_start_notes(scenario)]
+    return lines + [f"note: {note}" for note in scenario.list_start_notes()]
 
 
 def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
@@ -209,92 +210,6 @@ def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
     if drive.armature_kg_m2 > 0.0:
         parts.append(f"drive {drive.armature_kg_m2:.4g} {inertia_unit}")
     return "; ".join(parts)
-
-
-def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
-    """Returns each distinct arm read from a URDF file, with the sites that use it."""
-    groups: list[tuple[Arm, list[str]]] = []
-    for name, spec in scenario.sites.items():
-        if not spec.arm.urdf:
-            continue
-        owners = next((owners for arm, owners in groups if arm == spec.arm), None)
-        if owners is None:
-            groups.append((spec.arm, [name]))
-        else:
-            owners.append(name)
-    return groups
-
-
-def list_arm_notes(scenario: Scenario) -> list[str]:
-    """Returns sentences about properties of the arms that may surprise a user.
-
-    For example, a joint of the URDF file may be held fixed, or an arm may start beyond a
-    position limit, which is then moved for this run. Empty if there are none.
-
-    Args:
-        scenario: The scenario.
-    """
-    notes = []
-    for arm, owners in _group_chains(scenario):
-        subject = f"arm of {', '.join(owners)}"
-        notes += [f"{subject}: {note}" for note in arm.read_chain(scenario.urdf).notes]
-    return notes + _list_start_notes(scenario)
-
-
-def _list_start_notes(scenario: Scenario) -> list[str]:
-    """Returns sentences about joints that start beyond a stop or a position limit."""
-    notes: list[str] = []
-    for name, spec in scenario.sites.items():
-        if spec.arm.urdf and spec.arm.stops:
-            notes += _list_stop_notes(scenario, name)
-        notes += _list_limit_notes(scenario, name)
-    return notes
-
-
-def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences about joints of an arm that start beyond a stop of the URDF file.
-
-    A real arm at rest can stand slightly beyond the nominal position of a stop.
-    """
-    spec = scenario.sites[name]
-    units = scenario.arms[name].joint_units("rad")
-    joints = spec.arm.read_chain(scenario.urdf).joints
-    notes = []
-    for joint, start, unit in zip(joints, spec.q0_rad, units, strict=True):
-        excess = max(joint.lower - start, start - joint.upper)
-        if excess > 0.0:
-            notes.append(
-                f"{name} starts {excess:.3g} {unit} beyond a stop of joint {joint.name}: "
-                "the stop lies where the arm starts"
-            )
-    return notes
-
-
-def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
-    """Returns sentences about joints of an arm that start beyond a position limit.
-
-    The limit is moved for the run, so that the arm does not stop immediately.
-    """
-    spec = scenario.sites[name]
-    model = scenario.arms[name]
-    units = model.joint_units("rad")
-    stated = spec.limits.motion
-    in_force = scenario.motion_limits(name)
-    limits = (
-        ("q_min_rad", stated.q_min, in_force.q_min),
-        ("q_max_rad", stated.q_max, in_force.q_max),
-    )
-    joints = len(spec.q0_rad)
-    notes = []
-    for key, stated_limit, limit_in_force in limits:
-        before = np.broadcast_to(stated_limit, joints)
-        after = np.broadcast_to(limit_in_force, joints)
-        notes += [
-            f"{name} starts beyond {key} of joint {model.joint_names[n]}: the limit lies at "
-            f"{float(after[n]):.4g} {units[n]} in this run"
-            for n in np.flatnonzero(before != after).tolist()
-        ]
-    return notes
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
@@ -414,12 +329,6 @@ def _describe_stop(scenario: Scenario, name: str) -> list[str]:
 
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")
 """Keys that only describe a scenario, or that are compared separately."""
-_MAX_VALUE_LENGTH = 80
-"""Maximum length of the string form of a value."""
-_HASH_DIGITS = 8
-"""Number of digits of a SHA-256 hash shown in the string form of a value."""
-
-
 _EVERY_LINK = "every link"
 _SOME_LINKS = "link "
 """Prefix of the key of a difference between links, followed by the names of the links."""
@@ -567,50 +476,3 @@ def describe_law(control: Mapping[str, Any]) -> str:
         gains = _omit_keys(control, ["law"])
     text = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
     return f"{name} ({text})" if text or "code" not in control else name
-
-
-def _join_leading(entries: Sequence[str], separator: str) -> str:
-    """Joins as many leading entries as fit into `_MAX_VALUE_LENGTH` characters.
-
-    The first entry is always included. Omitted entries are replaced with "...".
-
-    Args:
-        entries: Strings to join.
-        separator: Separator between two entries.
-    """
-    text = ""
-    for entry in entries:
-        longer = f"{text}{separator}{entry}" if text else entry
-        if text and len(longer) > _MAX_VALUE_LENGTH:
-            return f"{text}{separator}..."
-        text = longer
-    return text
-
-
-def describe_value(value: Any) -> str:
-    """Formats a scenario value as a short string for users.
-
-    A list of equal numbers is written as a single number, file hashes are shortened, and long
-    tables or lists are truncated.
-
-    Args:
-        value: Any value that a scenario may contain.
-    """
-    if value is None or value == [] or value == ():
-        return "none"
-    if isinstance(value, dict):
-        texts = []
-        for key, entry in value.items():
-            text = describe_value(entry)
-            if key.endswith("sha256"):
-                text = text[:_HASH_DIGITS]
-            texts.append(text if key == "kind" else f"{key} {text}")
-        return _join_leading(texts, " ")
-    if isinstance(value, list | tuple):
-        entries = [describe_value(entry) for entry in value]
-        is_uniform = isinstance(value[0], int | float) and len(set(entries)) == 1
-        return entries[0] if is_uniform else f"[{_join_leading(entries, ', ')}]"
-    text = f"{value:g}" if isinstance(value, float) else str(value)
-    if len(text) > _MAX_VALUE_LENGTH:
-        text = f"{text[: _MAX_VALUE_LENGTH - 3]}..."
-    return text

@@ -23,6 +23,14 @@ from ..records import JOINTS, PARAMETERS
 
 StructType = type[msgspec.Struct]
 
+_COUNT_TEXTS = {
+    "joints": ("the arm has", "joint"),
+    "parameters": ("the arm has", "parameter"),
+    "axes": ("the space of the arm has", "axis"),
+    "shared": ("sites share", "coordinate"),
+}
+"""Start and noun of a sentence about each count, as in "the arm has 2 joints"."""
+
 
 class VectorCounts(NamedTuple):
     """Lengths of the vectors that belong to one arm, for example 6 gains for 6 joints.
@@ -57,6 +65,59 @@ class VectorCounts(NamedTuple):
             axes=3,
             shared=shared or joints,
         )
+
+    def expand_vectors(self, table: TomlTable, kind: StructType) -> TomlTable:
+        """Expands scalars to vectors of the length that the arm needs.
+
+        For example, `Kd = 5` becomes a vector of fives with one entry per joint. A distribution
+        such as `{ uniform = [1, 2] }` is repeated in the same way. A missing vector is set to
+        the default of its type, with the right length.
+
+        Args:
+            table: A table of a scenario.
+            kind: Type of the table.
+
+        Returns:
+            The expanded table. Other keys are unchanged.
+        """
+        lengths: dict[str, int] = {}
+        for key, per in _vector_keys(kind, "per").items():
+            lengths[key] = getattr(self, per)
+        expanded: TomlTable = {}
+        for field in list_fields(kind):
+            name = field.name
+            if name in lengths and isinstance(field.default, tuple):
+                expanded[name] = [field.default[0]] * lengths[name]
+        for key, value in table.items():
+            is_single = is_number(value) or is_distribution(value)
+            if key in lengths and is_single:
+                expanded[key] = [value] * lengths[key]
+            else:
+                expanded[key] = value
+        return expanded
+
+    def find_problem(self, table: TomlTable, kind: StructType) -> KeyProblem | None:
+        """Finds the first vector of a table that has too few or too many entries.
+
+        A scalar in place of a vector is not a problem.
+
+        Args:
+            table: A table of a scenario whose values have the right types.
+            kind: Type of the table.
+
+        Returns:
+            The key and the problem, or None if all vectors have the right length.
+        """
+        count_names = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
+        for key, per in count_names.items():
+            required = getattr(self, per)
+            value = table.get(key)
+            if not isinstance(value, list | tuple) or len(value) == required:
+                continue
+            numbers = count_nouns(len(value), "number")
+            owner, noun = _COUNT_TEXTS[per]
+            return KeyProblem(key, f"has {numbers}, and {owner} {count_nouns(required, noun)}")
+        return None
 
 
 def find_extra(hint: Any, name: str) -> str | None:
@@ -108,74 +169,6 @@ def list_fields(kind: StructType) -> tuple[msgspec.structs.FieldInfo, ...]:
     and a scenario has many tables of the same type.
     """
     return msgspec.structs.fields(kind)
-
-
-def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
-    """Expands scalars to vectors of the length that the arm needs.
-
-    For example, `Kd = 5` becomes a vector of fives with one entry per joint. A distribution
-    such as `{ uniform = [1, 2] }` is repeated in the same way. A missing vector is set to the
-    default of its type, with the right length.
-
-    Args:
-        table: A table of a scenario.
-        kind: Type of the table.
-        counts: Lengths of the vectors of the site.
-
-    Returns:
-        The expanded table. Other keys are unchanged.
-    """
-    lengths: dict[str, int] = {}
-    for key, per in _vector_keys(kind, "per").items():
-        lengths[key] = getattr(counts, per)
-    expanded: TomlTable = {}
-    for field in list_fields(kind):
-        name = field.name
-        if name in lengths and isinstance(field.default, tuple):
-            expanded[name] = [field.default[0]] * lengths[name]
-    for key, value in table.items():
-        is_single = is_number(value) or is_distribution(value)
-        if key in lengths and is_single:
-            expanded[key] = [value] * lengths[key]
-        else:
-            expanded[key] = value
-    return expanded
-
-
-_COUNT_TEXTS = {
-    "joints": ("the arm has", "joint"),
-    "parameters": ("the arm has", "parameter"),
-    "axes": ("the space of the arm has", "axis"),
-    "shared": ("sites share", "coordinate"),
-}
-"""Start and noun of a sentence about each count, as in "the arm has 2 joints"."""
-
-
-def find_count_problem(
-    table: TomlTable, kind: StructType, counts: VectorCounts
-) -> KeyProblem | None:
-    """Finds the first vector of a table that has too few or too many entries.
-
-    A scalar in place of a vector is not a problem.
-
-    Args:
-        table: A table of a scenario whose values have the right types.
-        kind: Type of the table.
-        counts: Lengths of the vectors of the site.
-
-    Returns:
-        The key and the problem, or None if all vectors have the right length.
-    """
-    count_names = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
-    for key, per in count_names.items():
-        required = getattr(counts, per)
-        value = table.get(key)
-        if not isinstance(value, list | tuple) or len(value) == required:
-            continue
-        numbers = count_nouns(len(value), "number")
-        owner, noun = _COUNT_TEXTS[per]
-        return KeyProblem(key, f"has {numbers}, and {owner} {count_nouns(required, noun)}")
-    return None
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -21,20 +21,18 @@ Invariant:
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
-import numpy as np
 
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import TomlTable
 from .distributions import Draws
+from .dominance_rows import resolve_dominance_row
 from .expect import Expect
-from .key_checks import check_keys, is_number
+from .key_checks import check_keys
 from .link_tables import change_link, complete_link_tables
 from .named_files import NamedFiles, use_unix_line_ends
 from .site_tables import complete_site_tables
-from .validate import find_row_problem
 from .written_tables import WrittenChange, WrittenScenario
 
 
@@ -86,38 +84,6 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
         "drawn": draws.drawn,
         "urdf": files.list_used_texts(sites),
     }
-
-
-def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) -> TomlTable:
-    """Completes the dominance factors of one site.
-
-    Args:
-        written: Row as written by its author, or None if there is none. A peer that is not
-            named has the factor 0.
-        names: Names of all sites of the scenario.
-        site: Name of the site to which the row belongs.
-        path: Path of the row, for error messages.
-
-    Returns:
-        Mapping from peer name to dominance factor.
-
-    Raises:
-        ScenarioError: A factor is not a number, or the row as a whole is not valid.
-    """
-    if written is None:
-        raise ScenarioError("is missing; name the sites that this site follows", path=path)
-    row = check_keys(written, names, path)
-    for peer, factor in row.items():
-        if not is_number(factor):
-            raise ScenarioError(f"must be a number, but is {factor!r}", path=f"{path}.{peer}")
-
-    factors = {name: float(row.get(name, 0.0)) for name in names}
-    row_vector = np.array(list(factors.values()))
-    problem = find_row_problem(row_vector, names.index(site))
-    if problem:
-        raise ScenarioError(problem, path=path)
-    del factors[site]
-    return factors
 
 
 def _complete_timeline(

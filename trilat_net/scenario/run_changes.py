@@ -16,15 +16,14 @@ from typing import Any
 
 import msgspec
 
-from ..core import CoreChange
 from ..errors import ScenarioError
 from ..records import NS_PER_S
 from .change import Change
 from .delay_models import LinkBase
 from .refusals import check_table
-from .resolve import complete_target, resolve_dominance_row
+from .resolve import complete_target
 from .scenario_types import Scenario
-from .validate import check_change, check_links_memory
+from .validate import check_links_memory
 from .written_tables import WrittenChange
 
 
@@ -89,7 +88,7 @@ def resolve_change(
         )
 
     complete = check_table(change, Change, "change")
-    check_change(complete, "change")
+    complete.check_link("change")
 
     # A longer delay may need more memory at the receiver.
     if complete.link:
@@ -98,50 +97,3 @@ def resolve_change(
         )
         check_links_memory(changed_scenario, complete.owner)
     return complete
-
-
-def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
-    """Parses a logged change into the record that the compiled control loop reads.
-
-    The log may come from an untrusted source, so the change is validated completely.
-
-    Args:
-        scenario: Scenario of the run.
-        site: Name of the site that published the record.
-        text: The change as JSON, as stored in the record.
-
-    Raises:
-        ScenarioError: The text is not a valid change, or the change belongs to another site.
-    """
-    try:
-        change = msgspec.json.decode(text, type=Change)
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise ScenarioError(
-            f"the record contains a command that cannot be read: {error}", path=text[:80]
-        ) from None
-    sites = ("", *scenario.names)
-    if (
-        change.link not in ("", *scenario.links)
-        or change.dominance not in sites
-        or change.site not in sites
-    ):
-        raise ScenarioError(
-            "the record contains a command for a link or site that does not exist",
-            path=text[:80],
-        )
-
-    targets = [name for name in (change.link, change.dominance, change.site) if name]
-    is_order = bool(change.order)
-    is_for_site = change.owner == site
-    if not is_for_site or len(targets) != 1 or bool(change.site) != is_order:
-        raise ScenarioError(
-            f"the record contains a command that is not for {site}", path=text[:80]
-        )
-
-    if is_order:
-        # called only to check the change
-        scenario.make_site_order(site, change.order, change.start_ns)
-    check_change(change, "cmd")
-    if change.dominance:
-        resolve_dominance_row(change.to, list(scenario.names), change.dominance, "cmd.to")
-    return scenario.to_core_change(change)

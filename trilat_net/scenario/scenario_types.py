@@ -27,27 +27,26 @@ from ..core import (
     DominanceRamp,
     Gains,
     LawChannel,
-    LinkSetup,
     MotionLimits,
-    RestGains,
     SiteSetup,
-    link_key,
 )
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
-from ..laws import LawSettings, LawSituation, StabilityCondition
+from ..laws import LawSettings, LawSituation
 from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, list_named_code
 from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
-from .arms import START_MARGIN_RAD, ArmModel, build_arm, start_margin
+from .arms import START_MARGIN_RAD, Arm, ArmModel, build_arm, start_margin
 from .canonical_text import write_canonical_text
 from .change import Change
 from .delay_models import Link, LinkBase
 from .delay_models.kernel_delays import ConstantDelay
 from .distributions import Distribution
+from .dominance_rows import resolve_dominance_row
 from .expect import Expect
 from .laws import ChosenLaw
 from .own_plant import OwnPlant
+from .site_setups import build_site_setup
 from .site_spec import SiteSpec
 
 _POSE_NUMBERS = 7
@@ -141,6 +140,41 @@ class Scenario(Frozen, frozen=True, dict=True):
             models[name] = model.widen_stops(spec.q0_rad)
         return models
 
+    def group_chains(self) -> list[tuple[Arm, list[str]]]:
+        """Returns each distinct arm read from a URDF file, with the sites that use it."""
+        groups: list[tuple[Arm, list[str]]] = []
+        for name, spec in self.sites.items():
+            if not spec.arm.urdf:
+                continue
+            owners = next((owners for arm, owners in groups if arm == spec.arm), None)
+            if owners is None:
+                groups.append((spec.arm, [name]))
+            else:
+                owners.append(name)
+        return groups
+
+    def list_arm_notes(self) -> list[str]:
+        """Returns sentences about properties of the arms that may surprise a user.
+
+        For example, a joint of the URDF file may be held fixed, or an arm may start beyond a
+        position limit, which is then moved for this run. Empty if there are none.
+        """
+        notes = []
+        for arm, owners in self.group_chains():
+            subject = f"arm of {', '.join(owners)}"
+            notes += [f"{subject}: {note}" for note in arm.read_chain(self.urdf).notes]
+        return notes + self.list_start_notes()
+
+    def list_start_notes(self) -> list[str]:
+        """Returns sentences about joints that start beyond a stop or a position limit."""
+        notes: list[str] = []
+        for name, spec in self.sites.items():
+            arm = self.arms[name]
+            if spec.arm.urdf and spec.arm.stops:
+                notes += spec.list_stop_notes(name, arm, self.urdf)
+            notes += spec.list_limit_notes(name, arm, self.motion_limits(name))
+        return notes
+
     @cached_property
     def alpha(self) -> Array:
         """Matrix of dominance factors at the start of the run, shape (N, N), Eq. (6).
@@ -187,7 +221,8 @@ class Scenario(Frozen, frozen=True, dict=True):
             index = (self.names.index(receiver), self.names.index(sender))
             delay_s[index] = link.find_effective_delay(self.sites[receiver].rate_hz)
         hold_s = self._find_hold_time()
-        hands = tuple(site.find_hand_impedances() for site in self.sites.values())
+        actors = tuple(site.actors for site in self.sites.values())
+        joints = tuple(len(site.q0_rad) for site in self.sites.values())
         for n, (name, site) in enumerate(self.sites.items()):
             situation = LawSituation(
                 site=n,
@@ -199,7 +234,8 @@ class Scenario(Frozen, frozen=True, dict=True):
                 rate_hz=site.rate_hz,
                 gravity_nm=self.arms[name].largest_gravity(site.arm.g_m_s2),
                 hold_s=hold_s,
-                hands=hands,
+                actors=actors,
+                joints=joints,
                 in_task_space=self.layout(name).task,
             )
             yield name, self.controls[n], situation
@@ -228,14 +264,15 @@ class Scenario(Frozen, frozen=True, dict=True):
             ticks_grow: True if the discrete-time loop is known to be unstable. The lines about
                 satisfied conditions then mention this.
         """
-        owners: dict[tuple[str, StabilityCondition], list[str]] = {}
+        conditions = {}
         for name, law, situation in self.law_situations():
             condition = law.condition(situation)
             if condition:
-                owners.setdefault((law.tag, condition), []).append(name)
+                conditions[name] = (law.tag, condition)
         verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
         lines = []
-        for (tag, condition), sites in owners.items():
+        for tag, condition in dict.fromkeys(conditions.values()):
+            sites = [name for name, owned in conditions.items() if owned == (tag, condition)]
             verdict = verdicts[condition.holds]
             line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
             if ticks_grow and condition.holds:
@@ -426,6 +463,18 @@ class Scenario(Frozen, frozen=True, dict=True):
         A simulation cannot run these sites.
         """
         return tuple(name for name, spec in self.sites.items() if spec.plant == "external")
+
+    def check_outside_arms(self) -> None:
+        """Raises ScenarioError if a real robot lacks limits or its reference could jump.
+
+        The check is made only before a session, since the scenarios in logs of earlier versions
+        may lack these keys.
+        """
+        for name in self.outside:
+            problem = self.sites[name].find_outside_problem(self.arms[name])
+            if problem is not None:
+                path = f"sites.{name}.{problem.key}"
+                raise ScenarioError(problem.problem, path=path, source=self.name)
 
     @property
     def simulated_settings(self) -> dict[str, Any]:
@@ -622,53 +671,13 @@ class Scenario(Frozen, frozen=True, dict=True):
             site: Name of the site.
         """
         if site not in self._setups:
-            self._setups[site] = self._build_setup(site)
+            self._setups[site] = build_site_setup(self, site)
         return self._setups[site]
 
     @cached_property
     def _setups(self) -> dict[str, SiteSetup]:
         """Cache of `setup`: mapping from site name to result."""
         return {}
-
-    def _build_setup(self, site: str) -> SiteSetup:
-        """Builds the settings returned and cached by `setup`.
-
-        Args:
-            site: Name of the site.
-        """
-        spec = self.sites[site]
-        arm = self.arms[site]
-        index = self.names.index(site)
-        control = self.controls[index]
-        rest_gains = RestGains()
-        if spec.on_stale.action == "glide":
-            rest_gains = self._rest_gains(site)
-        return SiteSetup(
-            name=site,
-            rate_hz=spec.rate_hz,
-            digital=self.scheme == "digital",
-            gains=self.gains(site),
-            theta=arm.theta,
-            g_m_s2=spec.arm.g_m_s2,
-            lengths_m=arm.lengths_m,
-            tau_limit_nm=spec.limits.tau_limit_nm,
-            qd_limit_rad_s=spec.limits.qd_limit_rad_s,
-            q0=spec.q0_rad,
-            qd0=spec.qd0_rad_s,
-            actors=tuple(actor.actor for actor in (*spec.hands, *spec.environment)),
-            links=tuple(self._link_setup(peer, site) for peer in self.peers(site)),
-            ramps=tuple(self.scripted_ramps(site)),
-            on_stale=spec.on_stale.rule,
-            external=spec.plant != "simulated",
-            law_factory=control.build_factory(len(self.sites), self.scheme),
-            theta_known=spec.arm.known,
-            chain=arm.chain,
-            channel=self.channel(site),
-            bodies=len(self.bodies_m(site)),
-            limits=self.motion_limits(site),
-            rest=rest_gains,
-            bit=1 << index,
-        )
 
     def motion_limits(self, site: str) -> MotionLimits:
         """Returns the limits on the motion of an arm during a run.
@@ -713,82 +722,6 @@ class Scenario(Frozen, frozen=True, dict=True):
         if spec.on_stale.action != "glide":
             return gains
         return arm.bound_estimates(gains, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
-
-    def _rest_gains(self, site: str) -> RestGains:
-        """Returns the gains of the controller that brings an arm to rest.
-
-        This controller acts, for example, when a peer has fallen silent. The gains depend on
-        the inertia of the arm, its torque limits, the control period, and the damping of the
-        control law.
-        """
-        spec = self.sites[site]
-        arm = self.arms[site]
-        gains = spec.control.linear_gains(arm.theta) or spec.control.gains(arm.theta)
-        # the damping that the law of the site already has, on each joint
-        law_damping: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
-        return arm.compute_rest_gains(
-            q0=spec.q0_rad,
-            law_damping=law_damping,
-            limit_nm=spec.limits.tau_limit_nm,
-            rate_hz=spec.rate_hz,
-            known=spec.arm.known,
-        )
-
-    def _link_setup(self, peer: str, site: str) -> LinkSetup:
-        """Returns the link between two sites in the format read by the compiled simulation.
-
-        Includes the planned changes of the link.
-
-        Args:
-            peer: Name of the sender.
-            site: Name of the receiver.
-        """
-        name = f"{peer}->{site}"
-        first_link = self.links[name]
-        later_links = self.scheduled_links(name)
-        links: list[tuple[int, LinkBase]] = [(0, first_link), *later_links]
-        peer_index = self.names.index(peer)
-        speed_limit: tuple[float, ...] = ()
-        if self.sites[site].on_stale.action == "glide":
-            speed_limit = self._speed_limit(peer)
-        return LinkSetup(
-            peer=peer,
-            alpha=self.dominance[site].get(peer, 0.0),
-            rate_hz=self.sites[peer].rate_hz,
-            q0=self.arms[peer].shared_pose(self.sites[peer].q0_rad),
-            key=link_key(self.seed, name),
-            models=tuple(link.to_core_model(from_ns) for from_ns, link in links),
-            traces=tuple(link.points for _, link in links),
-            outages=tuple(
-                (round(start_s * 1e9), round(end_s * 1e9))
-                for start_s, end_s in first_link.outages_s
-            ),
-            channel=self.channel(peer),
-            index_at_peer=self.peers(peer).index(site),
-            speed_limit=speed_limit,
-            bit=1 << peer_index,
-            followed=self._followed_sites(peer_index),
-            dispensable=self.sites[peer].role == "master",
-        )
-
-    def _followed_sites(self, index: int) -> int:
-        """Returns the sites that a site follows, as a bit mask with bit n set for site n.
-
-        For example, 0b101 stands for the first and the third site. The compiled code requires
-        this form.
-        """
-        return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
-
-    def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the speed limit of each joint of an arm, in rad/s.
-
-        Empty if the arms follow each other's end effectors.
-        """
-        spec = self.sites[site]
-        joints = self.arms[site].counts.joints
-        if spec.task.space != "joints":
-            return ()
-        return tuple(np.broadcast_to(spec.limits.qd_limit_rad_s, joints).tolist())
 
     def ramp(
         self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float
@@ -864,6 +797,52 @@ class Scenario(Frozen, frozen=True, dict=True):
             peer=self.peers(site).index(sender),
             model=change.after.to_core_model(change.start_ns),
         )
+
+    def parse_core_change(self, site: str, text: str) -> CoreChange:
+        """Parses a logged change into the record that the compiled control loop reads.
+
+        The log may come from an untrusted source, so the change is validated completely.
+
+        Args:
+            site: Name of the site that published the record.
+            text: The change as JSON, as stored in the record.
+
+        Raises:
+            ScenarioError: The text is not a valid change, or the change belongs to another
+                site.
+        """
+        try:
+            change = msgspec.json.decode(text, type=Change)
+        except (msgspec.DecodeError, msgspec.ValidationError) as error:
+            raise ScenarioError(
+                f"the record contains a command that cannot be read: {error}", path=text[:80]
+            ) from None
+        sites = ("", *self.names)
+        if (
+            change.link not in ("", *self.links)
+            or change.dominance not in sites
+            or change.site not in sites
+        ):
+            raise ScenarioError(
+                "the record contains a command for a link or site that does not exist",
+                path=text[:80],
+            )
+
+        targets = [name for name in (change.link, change.dominance, change.site) if name]
+        is_order = bool(change.order)
+        is_for_site = change.owner == site
+        if not is_for_site or len(targets) != 1 or bool(change.site) != is_order:
+            raise ScenarioError(
+                f"the record contains a command that is not for {site}", path=text[:80]
+            )
+
+        if is_order:
+            # called only to check the change
+            self.make_site_order(site, change.order, change.start_ns)
+        change.check_link("cmd")
+        if change.dominance:
+            resolve_dominance_row(change.to, list(self.names), change.dominance, "cmd.to")
+        return self.to_core_change(change)
 
     def with_constant_delays(self, delays_ms: Mapping[str, float]) -> "Scenario":
         """Returns a copy of the scenario with constant delays on some links.

@@ -6,24 +6,39 @@ Invariant:
 """
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from ..core import SCRIPTED_KINDS, Array, MotionLimits, StaleRule, TorqueKind
-from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
-from ..laws import ArmLoad
+from ..core import Array, MotionLimits, StaleRule, TorqueSource
+from ..fields import Frozen, Joints, KeyProblem, Positive, PositiveJoints, RateHz, Real
+from ..files import find_page
 from ..own_code import ImportedLaw
 from ..records import MAX_JOINTS
-from .arms import Arm, Task
+from .arms import Arm, ArmModel, Task
 from .delay_models import Link
 from .laws import ChosenLaw
 from .operators import Environment, Operator
 from .operators.kernel_operators import LiveHand
 from .operators.program_hand import ProgramHand
 from .own_plant import OwnPlant
+from .value_text import describe_value
+
+_OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad")
+"""Optional limits that become mandatory for a real robot."""
+_ASSUMED_LIMITS = {
+    "tau_limit_nm": ("efforts", "effort", "tau_limit_nm = 60.0"),
+    "qd_limit_rad_s": ("speeds", "velocity", "qd_limit_rad_s = 6.0"),
+}
+"""Limits that every scenario has, since a simulated arm has defaults for them.
+
+The entry for each key contains the attribute of the arm with the limits of its URDF file, the
+attribute of the `<limit>` element in that file, and an example.
+"""
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
@@ -209,6 +224,27 @@ class SiteSpec(Frozen, frozen=True):
         """Control law of the site if it is a user's Python class; None if it is built in."""
         return self.control if isinstance(self.control, ImportedLaw) else None
 
+    def describe_gains(self, *, with_defaults: bool = False) -> dict[str, str]:
+        """Returns the gains of the control law as short strings for users, such as "10" for K.
+
+        The gains of a user's law are the arguments of its class.
+
+        Args:
+            with_defaults: If True, arguments that the scenario leaves to the class of a user's
+                law are included.
+        """
+        gains = msgspec.structs.asdict(self.control)
+        if self.user_law is not None:
+            gains = self.user_law.settings
+            if with_defaults:
+                gains = self.user_law.read_default_settings() | gains
+        return {key: describe_value(value) for key, value in gains.items()}
+
+    @property
+    def actors(self) -> tuple[TorqueSource, ...]:
+        """Operators and environments of the arm, in the form read by the control loop."""
+        return tuple(source.actor for source in (*self.hands, *self.environment))
+
     @property
     def has_program_hand(self) -> bool:
         """True if a user's program operates the arm (a hand of kind "own").
@@ -218,32 +254,13 @@ class SiteSpec(Frozen, frozen=True):
         """
         return any(isinstance(hand, ProgramHand) for hand in self.hands)
 
-    def find_hand_impedances(self) -> tuple[ArmLoad, ...] | None:
-        """Returns the impedances of all operators and environments that react to motion.
+    @property
+    def needs_hand_process(self) -> bool:
+        """True if a user's program operates the arm from a process of its own when live.
 
-        Excludes operators whose torque depends on time alone.
-
-        Returns:
-            The spring and the damper of each. None if the reaction depends on the pose (because
-            an operator acts on the end effector), or is unknown (for a live operator or a
-            program).
+        A slow program then does not delay the control loop of the site.
         """
-        impedances = []
-        for actor in (*self.hands, *self.environment):
-            source = actor.actor
-            if source.kind in SCRIPTED_KINDS:
-                continue
-            # A sampled torque lags behind the motion, so it is not that of a spring and damper.
-            if source.kind not in (TorqueKind.HAND, TorqueKind.VISCOUS) or source.sampled:
-                return None
-            joints = len(self.q0_rad)
-            stiffness = source.K or (0.0,)
-            impedance = ArmLoad(
-                stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
-                damping_nm_s_rad=tuple(np.broadcast_to(source.B, joints).tolist()),
-            )
-            impedances.append(impedance)
-        return tuple(impedances)
+        return any(isinstance(hand, ProgramHand) and hand.process for hand in self.hands)
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
         """Returns the operator who may move the arm while the session runs.
@@ -259,6 +276,140 @@ class SiteSpec(Frozen, frozen=True):
             if isinstance(hand, LiveHand) and (hand.is_open or not is_open):
                 return hand
         return None
+
+    def with_live_hand_only(self, mode: str = "") -> "SiteSpec":
+        """Returns a copy of the site whose only operator is an open live operator.
+
+        The settings are those of the site's open live operator if there is one, and the
+        defaults otherwise.
+
+        Args:
+            mode: Mode of the operator, one of `HAND_MODES`. If empty, the mode is kept.
+        """
+        hand = self.find_live_hand(is_open=True) or LiveHand()
+        if mode:
+            hand = msgspec.structs.replace(hand, mode=mode)
+        return msgspec.structs.replace(self, hands=(hand,))
+
+    def list_stop_notes(self, name: str, arm: ArmModel, urdf: Mapping[str, str]) -> list[str]:
+        """Returns sentences about joints that start beyond a stop of the URDF file.
+
+        A real arm at rest can stand slightly beyond the nominal position of a stop.
+
+        Args:
+            name: Name of the site.
+            arm: Model of the arm.
+            urdf: Mapping from file name to content of the URDF files of the scenario.
+        """
+        units = arm.joint_units("rad")
+        joints = self.arm.read_chain(urdf).joints
+        notes = []
+        for joint, start, unit in zip(joints, self.q0_rad, units, strict=True):
+            excess = max(joint.lower - start, start - joint.upper)
+            if excess > 0.0:
+                notes.append(
+                    f"{name} starts {excess:.3g} {unit} beyond a stop of joint {joint.name}: "
+                    "the stop lies where the arm starts"
+                )
+        return notes
+
+    def list_limit_notes(self, name: str, arm: ArmModel, in_force: MotionLimits) -> list[str]:
+        """Returns sentences about joints that start beyond a position limit.
+
+        The limit is moved for the run, so that the arm does not stop immediately.
+
+        Args:
+            name: Name of the site.
+            arm: Model of the arm.
+            in_force: Limits of the run.
+        """
+        units = arm.joint_units("rad")
+        stated = self.limits.motion
+        limits = (
+            ("q_min_rad", stated.q_min, in_force.q_min),
+            ("q_max_rad", stated.q_max, in_force.q_max),
+        )
+        joints = len(self.q0_rad)
+        notes = []
+        for key, stated_limit, limit_in_force in limits:
+            before = np.broadcast_to(stated_limit, joints)
+            after = np.broadcast_to(limit_in_force, joints)
+            notes += [
+                f"{name} starts beyond {key} of joint {arm.joint_names[n]}: the limit lies at "
+                f"{float(after[n]):.4g} {units[n]} in this run"
+                for n in np.flatnonzero(before != after).tolist()
+            ]
+        return notes
+
+    def find_outside_problem(self, arm: ArmModel) -> KeyProblem | None:
+        """Finds a missing limit of a real robot, or a reason why its reference could jump.
+
+        Args:
+            arm: Model of the robot.
+
+        Returns:
+            The first such key and its problem, or None.
+        """
+        for key in _OUTSIDE_LIMITS:
+            if getattr(self.limits, key) is None:
+                return KeyProblem(
+                    f"limits.{key}",
+                    "is missing: an external arm needs limits on its position (q_min_rad, "
+                    "q_max_rad), its reference speed (qd_des_limit_rad_s) and its torque rate "
+                    "(tau_rate_limit_nm_s), in addition to tau_limit_nm and qd_limit_rad_s",
+                )
+        for key in _ASSUMED_LIMITS:
+            problem = self._find_assumed_limit(arm, key)
+            if problem is not None:
+                return problem
+        return self.find_jump_problem()
+
+    def _find_assumed_limit(self, arm: ArmModel, key: str) -> KeyProblem | None:
+        """Returns the problem that a limit of a real robot comes from a default, if it does.
+
+        A complete scenario does not distinguish defaults from values written by its author, so
+        a limit is treated as assumed if it equals the default. For the planar arm, the default
+        is a single number. For a chain, it appears at those joints for which the URDF file has
+        no limit.
+
+        Args:
+            arm: Model of the robot.
+            key: Key of the limit.
+        """
+        attribute, file_attribute, example = _ASSUMED_LIMITS[key]
+        default = getattr(Limits(), key)
+        limit = getattr(self.limits, key)
+        assumed: Any = default
+        if arm.chain is not None:
+            stated = getattr(arm, attribute)
+            assumed = [number if 0.0 < number < math.inf else default for number in stated]
+            if assumed == list(stated):
+                return None
+        if not np.array_equal(limit, assumed):
+            return None
+        alternative = f", or as <limit {file_attribute}=...> in its URDF file"
+        return KeyProblem(
+            f"limits.{key}",
+            f"is missing: {default:g} is the default of simulated arms, but an external arm "
+            f"needs a limit of its own: write one, as in {example}"
+            f"{alternative if arm.chain is not None else ''}",
+        )
+
+    def find_jump_problem(self) -> KeyProblem | None:
+        """Returns why the reference of a real robot may jump when a peer falls silent.
+
+        A jump would move the robot suddenly, so the stale rule must be "glide".
+
+        Returns:
+            The key of the stale rule and the problem, or None if the rule is "glide".
+        """
+        if self.on_stale.action == "glide":
+            return None
+        return KeyProblem(
+            "on_stale.action",
+            f"is {self.on_stale.action!r}, but an external arm needs 'glide', so that its site "
+            f"waits, holds and stops without a jump ({find_page('silent-peers.md')})",
+        )
 
 
 SITE_GROUPS: dict[str, type[Frozen]] = {

@@ -22,9 +22,7 @@ from .distributions import Draws, has_distribution
 from .key_checks import (
     VectorCounts,
     check_choice,
-    expand_vectors,
     field_names,
-    find_count_problem,
 )
 from .laws import LAWS
 from .link_inertia import LinkInertia
@@ -122,7 +120,7 @@ def _complete_control(
         raise _refuse_law(law, f"{path}.law")
     check_control(written, law, path)
     inherited = common if common_law == law else {}
-    return expand_vectors({**inherited, **written, "law": law}, LAWS[law], counts)
+    return counts.expand_vectors({**inherited, **written, "law": law}, LAWS[law])
 
 
 def _refuse_law(law: str, path: str) -> ScenarioError:
@@ -195,7 +193,7 @@ def _complete_site(site: TomlTable, name: str, shared: _SharedByAll) -> TomlTabl
     path = f"sites.{name}"
     model, arm = _complete_arm(site, shared, f"{path}.arm")
     counts = model.counts
-    site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
+    site = counts.expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec)
     site["arm"] = arm
     site["control"] = _complete_control(
         site.get("control", {}), shared.control, f"{path}.control", counts
@@ -261,7 +259,7 @@ def _complete_arm(
 
     if not table.get("urdf"):
         raise ScenarioError(_BELONGS_TO_CHAIN, path=f"{path}.armature_kg_m2")
-    armatures = expand_vectors({"armature_kg_m2": armature}, Arm, model.counts)
+    armatures = model.counts.expand_vectors({"armature_kg_m2": armature}, Arm)
     table |= shared.draws.draw_numbers(armatures, path)
     return _model_arm(table, site["task"], shared, path), table
 
@@ -384,6 +382,6 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
         (site["limits"], Limits, f"{path}.limits"),
     ]
     for table, kind, table_path in tables:
-        problem = find_count_problem(table, kind, counts)
+        problem = counts.find_problem(table, kind)
         if problem is not None:
             raise ScenarioError(problem.problem, path=f"{table_path}.{problem.key}")

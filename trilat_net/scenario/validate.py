@@ -3,8 +3,8 @@
 The types of the tables restrict individual keys. This module checks conditions that involve
 several keys, for example that a joint starts within its stops. `build_scenario` does both.
 
-`check_outside_arms` performs the additional checks required for a live session with real
-robots.
+`Scenario.check_outside_arms` performs the additional checks required for a live session with
+real robots.
 
 Invariant:
     - An error contains the path of the key in the scenario file.
@@ -13,139 +13,32 @@ Invariant:
       reason before anything runs.
 """
 
-import math
 from collections.abc import Sequence
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from ..core import (
     MAX_LINKS_BYTES,
-    ROW_SUM_TOLERANCE,
-    Array,
     DominanceMatrix,
     SiteArrays,
 )
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable
-from ..files import find_page
 from ..laws import LawSettings
 from ..own_code import ImportedLaw
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .change import Change
-from .delay_models import Link
 from .distributions import dotted_key
 from .operators import kernel_operators
 from .operators.program_hand import ProgramHand
-from .refusals import convert_drawn, refuse
+from .refusals import convert_drawn
 from .scenario_types import Scenario
-from .site_spec import Limits, SiteSpec
+from .site_spec import SiteSpec
 
 RANK_TOLERANCE = 1e-6
 """Singular value, relative to the largest, below which a direction counts as immobile."""
-
-
-OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad")
-"""Optional limits that become mandatory for a real robot."""
-
-
-_ASSUMED_LIMITS = {
-    "tau_limit_nm": ("efforts", "effort", "tau_limit_nm = 60.0"),
-    "qd_limit_rad_s": ("speeds", "velocity", "qd_limit_rad_s = 6.0"),
-}
-"""Limits that every scenario has, since a simulated arm has defaults for them.
-
-The entry for each key contains the attribute of the arm with the limits of its URDF file, the
-attribute of the `<limit>` element in that file, and an example.
-"""
-
-
-def _refuse_assumed_limit(scenario: Scenario, name: str, key: str) -> None:
-    """Raises ScenarioError if a limit of a real robot comes from a default.
-
-    A complete scenario does not distinguish defaults from values written by its author, so a
-    limit is treated as assumed if it equals the default. For the planar arm, the default is a
-    single number. For a chain, it appears at those joints for which the URDF file has no limit.
-
-    Args:
-        scenario: The scenario.
-        name: Name of the site of the robot.
-        key: Key of the limit.
-
-    Raises:
-        ScenarioError: The limit is assumed.
-    """
-    attribute, file_attribute, example = _ASSUMED_LIMITS[key]
-    default = getattr(Limits(), key)
-    limit = getattr(scenario.sites[name].limits, key)
-    arm = scenario.arms[name]
-    assumed: Any = default
-    if arm.chain is not None:
-        stated = getattr(arm, attribute)
-        assumed = [number if 0.0 < number < math.inf else default for number in stated]
-        if assumed == list(stated):
-            return
-    if not np.array_equal(limit, assumed):
-        return
-    alternative = f", or as <limit {file_attribute}=...> in its URDF file"
-    raise ScenarioError(
-        f"is missing: {default:g} is the default of simulated arms, but an external arm "
-        f"needs a limit of its own: write one, as in {example}"
-        f"{alternative if arm.chain is not None else ''}",
-        path=f"sites.{name}.limits.{key}",
-        source=scenario.name,
-    )
-
-
-def check_outside_arms(scenario: Scenario) -> None:
-    """Raises ScenarioError if a real robot lacks limits or its reference could jump.
-
-    Except under the stale rule "glide", the reference could jump when samples of a peer stop
-    arriving or arrive again. The check is performed only before a session, since the scenarios
-    in logs of earlier versions may lack these keys.
-
-    Args:
-        scenario: The scenario.
-
-    Raises:
-        ScenarioError: A key is missing or wrong. The error contains the path of the first such
-            key.
-    """
-    for name in scenario.outside:
-        site = scenario.sites[name]
-        for key in OUTSIDE_LIMITS:
-            if getattr(site.limits, key) is None:
-                raise ScenarioError(
-                    "is missing: an external arm needs limits on its position (q_min_rad, "
-                    "q_max_rad), its reference speed (qd_des_limit_rad_s) and its torque rate "
-                    "(tau_rate_limit_nm_s), in addition to tau_limit_nm and qd_limit_rad_s",
-                    path=f"sites.{name}.limits.{key}",
-                    source=scenario.name,
-                )
-        for key in _ASSUMED_LIMITS:
-            _refuse_assumed_limit(scenario, name, key)
-        _refuse_jumping_arm(scenario, name)
-
-
-def _refuse_jumping_arm(scenario: Scenario, name: str) -> None:
-    """Raises ScenarioError if the reference of a real robot may jump when a peer falls silent.
-
-    A jump would move the robot suddenly, so the stale rule must be "glide".
-
-    Args:
-        scenario: The scenario.
-        name: Name of the site of the robot.
-    """
-    action = scenario.sites[name].on_stale.action
-    if action != "glide":
-        raise ScenarioError(
-            f"is {action!r}, but an external arm needs 'glide', so that its site waits, holds "
-            f"and stops without a jump ({find_page('silent-peers.md')})",
-            path=f"sites.{name}.on_stale.action",
-            source=scenario.name,
-        )
 
 
 def _check_law(name: str, site: SiteSpec, sites: int) -> None:
@@ -260,7 +153,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_links(scenario)
     _check_stale_rules(scenario)
     for n, change in enumerate(scenario.timeline):
-        check_change(change, f"timeline[{n}]")
+        change.check_link(f"timeline[{n}]")
     for name in scenario.names:
         check_links_memory(scenario, name)
 
@@ -495,8 +388,13 @@ def _check_limits(scenario: Scenario, name: str) -> None:
 
     for key in ("q_min_rad", "q_max_rad"):
         if getattr(site.limits, key) is not None and site.on_stale.action != "glide":
-            if name in scenario.outside:
-                _refuse_jumping_arm(scenario, name)  # the limits of a real robot must stay
+            jump_problem = site.find_jump_problem()
+            if name in scenario.outside and jump_problem is not None:
+                raise ScenarioError(  # the limits of a real robot must stay
+                    jump_problem.problem,
+                    path=f"sites.{name}.{jump_problem.key}",
+                    source=scenario.name,
+                )
             raise ScenarioError(
                 "applies only with on_stale.action = 'glide', but the action is "
                 f"{site.on_stale.action!r}",
@@ -576,29 +474,6 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
             "joint, or follow fewer axes (task.axes)",
             path=f"sites.{name}.q0_rad",
         )
-
-
-def find_row_problem(row: Array, site: int) -> str | None:
-    """Checks one row of the dominance matrix, Eq. (7).
-
-    The factors must lie between 0 and 1 and sum to 1, and the arm must not follow itself.
-
-    Args:
-        row: Dominance factors of one site, shape (N,).
-        site: Index of that site.
-
-    Returns:
-        The problem as a clause for an error message, or None if the row is valid.
-    """
-    if not np.isfinite(row).all():
-        return "shares must be finite numbers"
-    if row[site] != 0.0:
-        return f"a site does not follow itself, yet its own share is {row[site]:g}"
-    if (row < 0.0).any() or (row > 1.0).any():
-        return "shares must lie between 0 and 1"
-    if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
-        return f"shares must sum to 1, Eq. (7), and sum to {row.sum():.12g}"
-    return None
 
 
 def _check_actors(
@@ -762,31 +637,3 @@ def _can_lose_master(scenario: Scenario, name: str) -> bool:
         if follows_others and DominanceMatrix(remaining).is_irreducible:
             return True
     return False
-
-
-def check_change(change: Change, path: str) -> None:
-    """Raises ScenarioError if a link would have invalid settings after a change.
-
-    Changes other than those of a link have already been checked and are accepted.
-
-    Args:
-        change: Change of a link or of a site's dominance factors.
-        path: Path of the change in the scenario, for error messages.
-
-    Raises:
-        ScenarioError: A setting of the link is not valid, or the change of a link specifies a
-            transition time. The error contains the path of the key.
-    """
-    if not change.link:
-        return
-    if change.ramp_s:
-        raise ScenarioError(
-            "a link changes at once; only shares have a ramp", path=f"{path}.ramp_s"
-        )
-    try:
-        link = change.after
-    except msgspec.ValidationError as error:
-        raise refuse(error, change.to, Link, f"{path}.to") from None
-    problem = link.find_problem()
-    if problem is not None:
-        raise ScenarioError(problem.problem, path=f"{path}.to.{problem.key}")

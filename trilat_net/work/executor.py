@@ -129,7 +129,7 @@ def run_batch(
 class _Batch(NamedTuple):
     """A group of items that one worker process is working on.
 
-    It lists the items that return to the queue if the worker dies.
+    The items return to the queue if the worker dies.
 
     Attributes:
         numbers: Numbers of the items in the study, counted from 0.
@@ -532,11 +532,9 @@ class WorkerPool:
         feed: _Feed[T],
         lost: Callable[[T], R] | None,
     ) -> Iterator[tuple[int, R]]:
-        """Yields the results of a finished batch.
+        """Yields the results of a finished batch, a group of items that one worker received.
 
-        If its worker died, the items are queued again.
-
-        A batch is a group of items that one worker process receives together.
+        If the worker process died, the items are queued again.
 
         Args:
             future: Future of the batch.

@@ -26,10 +26,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from trilat_net.app import Device, DeviceState, Vector
-from trilat_net.core import GRIP_NS, SILENCE_NS, HandReach
-from trilat_net.errors import count_nouns
+from trilat_net.core import GRIP_NS, SILENCE_NS
+from trilat_net.errors import UsageError, count_nouns
 from trilat_net.net import Clock, Hand
-from trilat_net.scenario import LiveHand
+from trilat_net.scenario import Scenario
 
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""
@@ -52,10 +52,10 @@ class DeviceHand:
     Args:
         hand: Connection to the site of the arm, in the role of its operator.
         device: The input device.
-        operator: Live operator in the scenario. Its device settings determine how the device
-            moves the arm and how the force is rendered.
+        scenario: Scenario of the session. The device settings of the live operator determine
+            how the device moves the arm and how the force is rendered.
+        site: Name of the site of the arm.
         clock: Clock of this machine.
-        reach: Region that the arm can reach. The target never leaves it.
 
     Attributes:
         states: Number of device states (position, velocity, buttons) that were read.
@@ -63,21 +63,31 @@ class DeviceHand:
         unreadable: Number of states ignored because they contained NaN or infinity.
         trips_ns: Times from reading a device position to rendering the force caused by it, in
             ns.
+
+    Raises:
+        UsageError: The live operator does not move the end effector of the arm.
     """
 
     def __init__(
         self,
         hand: Hand,
         device: Device,
-        operator: LiveHand,
+        scenario: Scenario,
+        site: str,
         clock: Clock,
-        reach: HandReach,
     ) -> None:
+        operator = scenario.sites[site].find_live_hand(is_open=True)
+        if operator is None or operator.mode != "tip":
+            raise UsageError(
+                "a device can lead only an end effector: "
+                f"the hand of {site} must have the mode 'tip'"
+            )
         self._hand = hand
         self._device = device
         self._settings = operator.device
         self._clock = clock
-        self._reach = reach
+        # The target never leaves the region that the arm can reach.
+        self._reach = scenario.arms[site].reach
         # The axes of the arm in the coordinates of the device, a row per axis of the arm.
         self._axes = self._settings.rows(len(hand.pose))
 

@@ -448,7 +448,7 @@ class WindowStats:
         self._to_ns = round(to_s * NS_PER_S)
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._arm = build_arm_rows(scenario, site)
-        self._walls = VirtualWall.list_of_site(spec)
+        self._walls = VirtualWall.list_of_site(scenario, site)
 
         self._last_ns = -1
         self._records = 0

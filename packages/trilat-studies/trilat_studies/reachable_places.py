@@ -10,12 +10,12 @@ Invariant:
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from trilat_net.core import Array
-from trilat_net.scenario import ArmModel
+from trilat_net.core import Array, ChainJoint
+from trilat_net.scenario import Scenario
 
 PLANAR_MARGIN = 0.01
 """Minimum distance of a position from the limit of a planar arm's reach, as a fraction of the
@@ -33,21 +33,27 @@ _LARGEST_STEP_RAD = 0.5
 """Largest change of a joint in one step, in rad or m."""
 
 
-def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Array) -> bool:
+EndEffector = Callable[[list[float]], Sequence[float]]
+"""Returns the position of an end effector at given joint angles, in m."""
+
+
+def can_reach(scenario: Scenario, site: str, start_rad: Array, position_m: Array) -> bool:
     """Returns True if a pose was found that places the end effector at a given position.
 
     For a two-link arm, the link lengths decide. For a chain with more joints, a numerical
     search within the joint limits decides, and may miss an existing pose.
 
     Args:
-        arm: Model of the arm.
+        scenario: The scenario.
+        site: Name of the site of the arm.
         start_rad: Joint angles from which the search starts for a chain, shape (n,), in rad.
-        position_m: The position, in the coordinates of `ArmModel.end_effector`, in m.
+        position_m: The position, in the coordinates of the end effector, in m.
     """
+    arm = scenario.arms[site]
     if arm.chain is not None:
         start = np.array(start_rad, dtype=np.float64)
         target_m = np.asarray(position_m)
-        return _find_pose(arm, start, target_m)
+        return _find_pose(arm.end_effector, arm.chain.joints, start, target_m)
     first_m, second_m = arm.lengths_m
     length_m = first_m + second_m
     farthest_m = length_m - PLANAR_MARGIN * length_m
@@ -56,7 +62,9 @@ def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Arr
     return nearest_m <= distance_m <= farthest_m
 
 
-def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
+def _find_pose(
+    locate: EndEffector, joints: Sequence[ChainJoint], q: Array, position_m: Array
+) -> bool:
     """Searches for a pose within the joint limits that places the end effector at a position.
 
     Each step moves the joints by damped least squares (Wampler 1986): with the Jacobian J and
@@ -64,25 +72,24 @@ def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
     finite near singular poses. The joints are then clipped to their limits.
 
     Args:
-        arm: A chain.
+        locate: Forward kinematics of the chain.
+        joints: Joints of the chain, with their limits.
         q: Joint positions from which the search starts, shape (n,).
         position_m: The position, in m.
 
     Returns:
         True if a pose was found.
     """
-    assert arm.chain is not None
-    joints = arm.chain.joints
     lower = np.array([joint.lower for joint in joints])
     upper = np.array([joint.upper for joint in joints])
     for _ in range(_STEPS):
-        end_effector_m = np.array(arm.end_effector(q.tolist()))
+        end_effector_m = np.array(locate(q.tolist()))
         error_m = position_m - end_effector_m
         distance_m = float(np.linalg.norm(error_m))
         if distance_m <= FOUND_WITHIN_M:
             return True
 
-        J = _compute_jacobian(arm, q, end_effector_m)
+        J = _compute_jacobian(locate, q, end_effector_m)
         identity = np.eye(len(end_effector_m))
         damped_matrix = J @ J.T + _DAMPING * identity
         step = J.T @ np.linalg.solve(damped_matrix, error_m)
@@ -93,11 +100,11 @@ def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
     return False
 
 
-def _compute_jacobian(arm: ArmModel, q: Array, end_effector_m: Array) -> Array:
+def _compute_jacobian(locate: EndEffector, q: Array, end_effector_m: Array) -> Array:
     """Computes the Jacobian of a chain's end effector by forward differences, shape (m, n).
 
     Args:
-        arm: A chain.
+        locate: Forward kinematics of the chain.
         q: Joint positions, shape (n,).
         end_effector_m: Position of the end effector at `q`, shape (m,), in m.
     """
@@ -107,7 +114,7 @@ def _compute_jacobian(arm: ArmModel, q: Array, end_effector_m: Array) -> Array:
     for joint in range(joint_count):
         probe = q.copy()
         probe[joint] += _PROBE_RAD
-        probe_m = np.array(arm.end_effector(probe.tolist()))
+        probe_m = np.array(locate(probe.tolist()))
         motion_m = probe_m - end_effector_m
         jacobian[:, joint] = motion_m / _PROBE_RAD
     return jacobian

@@ -26,8 +26,6 @@ from typing import (
     Any,
     NamedTuple,
     Protocol,
-    get_args,
-    get_type_hints,
 )
 
 import numpy as np
@@ -39,10 +37,9 @@ from trilat_net.execution import FusedRun, record_virtual
 from trilat_net.files import Extra
 from trilat_net.log import expand_poses
 from trilat_net.scenario import (
+    HAND_MODES,
     HandPlayer,
     HandSite,
-    LiveHand,
-    PlantPlayer,
     Scenario,
     load_scenario,
 )
@@ -455,11 +452,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         scenario.find_site(self.user)
         scenario.find_site(self.leads)
         spec = scenario.sites[self.user]
-        hand = spec.find_live_hand(is_open=True) or LiveHand()
-        if self._mode:
-            hand = replace(hand, mode=self._mode)
         sites = dict(scenario.sites)
-        sites[self.user] = replace(spec, hands=(hand,))
+        sites[self.user] = spec.with_live_hand_only(self._mode)
         # The values that the removed operators would draw at random are removed too.
         removed_keys = f"{self.user}.hands"
         drawn = dict(scenario.drawn)
@@ -539,11 +533,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._clipped_actions = 0
         hand_site = self.build_hand_site(scenario)
         self._player = _ActedHand(hand_site, self._actions)
-        self._plants = PlantPlayer.make_all(scenario)  # users' programs that move arms, by site
         hands = {self.user: self._player}
         ticks = [scenario.ticks(name) for name in scenario.names]
         # The environment reads the state of the last tick only, so one record is kept.
-        self._run = FusedRun(scenario, keep=1, hands=hands, plants=self._plants)
+        self._run = FusedRun(scenario, keep=1, hands=hands, runs_plants=True)
         self._run.plan(ticks)  # allocates memory for all ticks of the episode
         self._ticks = scenario.ticks(self.user)
         self._tick_rate_hz = scenario.sites[self.user].rate_hz
@@ -572,7 +565,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             positions_m[name] = np.array(position_m)
 
         bodies = {}
-        for site, plant in self._plants.items():
+        for site, plant in self._run.plants.items():
             body_names = self.scenario.bodies_m(site)
             # A pose has seven numbers: the position in m, and a unit quaternion.
             poses = np.reshape(plant.state.bodies, (-1, 7))
@@ -604,9 +597,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             site: Name of the site.
             position_m: The position, in m.
         """
-        arm = self.scenario.arms[site]
-        start_rad = q[site]
-        return can_reach(arm, start_rad, position_m)
+        return can_reach(self.scenario, site, q[site], position_m)
 
     def _format_observation(self, scene: Scene) -> Any:
         """Returns the user's observation of a state, in the format of the observation space."""
@@ -811,7 +802,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     @property
     def plants(self) -> Mapping[str, Any]:
         """User-written simulation models of arms, by site name."""
-        return self._plants
+        return self._run.plants
 
     def note_steps(self, actions: Sequence[Array], clipped_actions: int, *, ends: bool) -> None:
         """Records the actions of an episode that a vector environment has simulated.
@@ -988,9 +979,8 @@ def _check_arguments(
     Raises:
         UsageError: An argument is not valid. The message names its value and the valid values.
     """
-    modes = get_args(get_type_hints(LiveHand)["mode"])
-    if mode not in ("", *modes):
-        choices = ", ".join(map(repr, modes))
+    if mode not in ("", *HAND_MODES):
+        choices = ", ".join(map(repr, HAND_MODES))
         raise UsageError(f"mode must be {choices} or empty, not {mode!r}")
     if isinstance(rate_hz, bool) or not isinstance(rate_hz, int) or rate_hz < 1:
         raise UsageError(f"rate_hz must be a whole number of steps per second, not {rate_hz!r}")

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from trilat_net.core import Array, HandView, LaneEpisodes, PeerView, tick_ns
 from trilat_net.errors import UsageError
-from trilat_net.scenario import LiveHand
 
 from .teleoperation_environment import (
     MOST_DRAWS,
@@ -902,8 +901,10 @@ def _copy_env(env: TeleoperationEnv) -> TeleoperationEnv:
 
 def _find_hand_row(env: TeleoperationEnv) -> int:
     """Returns the index of the live operator of the user's site among its operators."""
-    hands = env.scenario.sites[env.user].hands
-    return next(i for i, hand in enumerate(hands) if isinstance(hand, LiveHand))
+    spec = env.scenario.sites[env.user]
+    hand = spec.find_live_hand()
+    assert hand is not None  # every episode has one, see `TeleoperationEnv`
+    return spec.hands.index(hand)
 
 
 def _explain_steps(env: TeleoperationEnv, *, compiles: bool = True) -> str:

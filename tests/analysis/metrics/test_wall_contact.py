@@ -91,10 +91,9 @@ def test_contact_at_200_ms_hammers() -> None:
 def test_the_force_of_windup_creeps() -> None:
     """4.3 and 8.5 N at 10 and 20 s."""
     log = make_run("windup", {"duration_s": 40.0, "rate_hz": 50}).log
-    spec = log.scenario.sites["s"]
     track = AlignedRecords.by_site(log)["s"]
     end_effector = build_arm_rows(log.scenario, "s").place_end_effector(track.q, track.qd)
-    (wall,) = VirtualWall.list_of_site(spec)
+    (wall,) = VirtualWall.list_of_site(log.scenario, "s")
     force = wall.find_force(track.nominal_s, end_effector)
     assert force[50 * 10] == pytest.approx(4.3, abs=0.05)
     assert force[50 * 20] == pytest.approx(8.5, abs=0.1)

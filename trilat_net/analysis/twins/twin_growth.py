@@ -1058,4 +1058,4 @@ def _find_linear_sizes(
 
 def _has_wall(scenario: Scenario) -> bool:
     """Returns True if some site has a wall, because contact makes the run nonlinear."""
-    return any(map(VirtualWall.list_of_site, scenario.sites.values()))
+    return any(VirtualWall.list_of_site(scenario, site) for site in scenario.names)

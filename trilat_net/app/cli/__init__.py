@@ -599,7 +599,8 @@ def _find_split_setting(args: Sequence[str]) -> str:
     """Finds a value of --set that a shell has split, because the user did not quote it.
 
     A shell that expands braces makes two arguments of `dominance.m1={m2=0.1,s=0.9}`, which are
-    `dominance.m1=m2=0.1` and `dominance.m1=s=0.9`. A value with spaces is split at them.
+    `dominance.m1=m2=0.1` and `dominance.m1=s=0.9`. A value that contains spaces is split at the
+    spaces.
 
     Args:
         args: Arguments of a command.

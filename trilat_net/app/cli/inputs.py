@@ -68,8 +68,6 @@ def scenario_show_command(
     overrides: options.SetOption = None,
 ) -> None:
     """Prints a scenario in full, including every value of every site and link."""
-    from ...scenario import list_arm_notes
-
     if name.endswith(".mcap"):
         from ...log import open_log
 
@@ -82,7 +80,7 @@ def scenario_show_command(
     else:
         scenario = options.load_chosen_scenario(name, overrides, duration, seed)
     sys.stdout.write(scenario.text)
-    for note in list_arm_notes(scenario):
+    for note in scenario.list_arm_notes():
         terminal.print_note(note)
 
 
@@ -93,10 +91,10 @@ def scenario_check_command(
     as_json: options.JsonOption = False,
 ) -> None:
     """Checks a scenario and prints what its values imply."""
-    from ...scenario import check_outside_arms, describe_scenario
+    from ...scenario import describe_scenario
 
     scenario = options.load_chosen_scenario(file, overrides, None, None)
-    check_outside_arms(scenario)
+    scenario.check_outside_arms()
     lines = describe_scenario(scenario)
     if as_json:
         facts = {"name": scenario.name, "sha256": scenario.sha256, "consequences": lines}

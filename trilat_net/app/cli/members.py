@@ -594,8 +594,8 @@ def _warn_torn(torn: dict[Path, str]) -> None:
 def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> None:
     """Warns the user of everything in a replay that differed from the recording.
 
-    There may be damaged files, receivers that were disconnected because they were too slow, and
-    messages that were played late.
+    The warnings concern damaged files, receivers that were disconnected because they were too
+    slow, and messages that were played late.
 
     Args:
         outcome: Outcome of the replay.

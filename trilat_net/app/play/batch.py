@@ -313,8 +313,8 @@ def _find_equal_numbers(rows: Ints) -> Ints:
         rows: Table with a row per message, shape (K, 5), see `MessageBatch.rows`.
 
     Returns:
-        The rows of these messages in ascending order, shape (R,). It includes every message
-        that occurs more than once, also its first occurrence.
+        Indices of the rows of these messages in ascending order, shape (R,). Every message that
+        occurs more than once is included, also its first occurrence.
     """
     numbers = rows[:, _NUMBER]
     channels = rows[:, _CHANNEL]

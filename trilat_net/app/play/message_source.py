@@ -49,13 +49,12 @@ waits for the reader, and above that of other processes.
 
 
 class _RoundEnd(NamedTuple):
-    """Message from the process that reads a log: all messages of a round were sent.
+    """Item by which the reader process reports that it has sent all messages of a round.
 
     A round is one pass through the log. A log that is replayed in a loop has several rounds.
 
     Attributes:
-        strays: Number of messages that could not be played in order, because their position in
-            the file was too far from their turn.
+        strays: Number of messages that appear too late in the file to be played in order.
         torn: The damaged files, with the reason.
     """
 
@@ -64,7 +63,7 @@ class _RoundEnd(NamedTuple):
 
 
 class _ReadPiece(NamedTuple):
-    """A piece of a log that the process that reads the file sends to the player.
+    """Piece of a log that the reader process sends to the player.
 
     A separate process reads, so that decompression does not delay published messages.
 

@@ -208,11 +208,12 @@ class Playback:
         )
 
     def _wait_for_recorders(self) -> None:
-        """Waits until every recorder on the network is ready to receive, at most `LISTEN_NS`.
+        """Waits until every recorder on the network is ready to receive messages.
 
-        Otherwise the first messages could be missing from their logs. A recorder is ready when
-        it has replied to a query. If the options require a recorder, the waiting time begins
-        when one is present.
+        The wait lasts at most `LISTEN_NS`. Without this wait, the first messages could be
+        missing from the logs of the recorders. A recorder is ready when it has replied to a
+        query. If the options require a recorder, the waiting time begins when a recorder is
+        present.
         """
         clock = self.clock
         stand_ins = self._stand_ins
@@ -343,7 +344,7 @@ def _open_bus(
         say: Function that prints a line for the user.
 
     Returns:
-        The connection. None if `stopped` returned True.
+        The connection. `None` if `stopped` returned True.
 
     Raises:
         SessionError: A session of the same name is running.

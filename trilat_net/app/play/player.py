@@ -340,7 +340,11 @@ class Player:
                 self._history.clear()
 
     def _wait_for_batch(self) -> MessageBatch | None:
-        """Waits for the next messages. `None` at the end of the round, or if stopped."""
+        """Waits for the next messages and returns them.
+
+        Returns:
+            The messages. `None` at the end of the round, or if the playback was stopped.
+        """
         batch = self._first_batch
         self._first_batch = None
         while batch is None and not (self._source.ended or self._stopped()):
@@ -431,7 +435,7 @@ class Player:
         return True
 
     def _serve(self) -> None:
-        """Reads messages in advance, and does some other work."""
+        """Reads messages in advance, and does other work, such as replies to queries."""
         self._source.fill()
         self._serve_others(
             PlayProgress(self._position_ns, self._published, self.lateness.max_us)

@@ -354,7 +354,7 @@ class SiteStandIns:
         return self._boots.get(site, first_start)
 
     def _find_boot(self, site: str) -> int:
-        """Returns the boot, the random number of a start, of the start that is being played.
+        """Returns the boot of the start that is being played: the random number of this start.
 
         Recorders accept only replies of that start.
         """

@@ -72,7 +72,7 @@ _DETERMINISTIC_KINDS = (
 """Delay kinds that are not random."""
 
 
-class TraceEnd(IntEnum):
+class _TraceEnd(IntEnum):
     """How a recorded delay trace continues after its last entry.
 
     It either holds the last delay or starts again from the first.
@@ -91,7 +91,7 @@ class LinkModel(NamedTuple):
     Attributes:
         from_ns: First stamp to which the model applies, ns since the start of the session.
         kind: A `DelayKind`, which defines `location`, `scale`, `extra` and `weight`.
-        at_end: A `TraceEnd`, for a trace.
+        at_end: A `_TraceEnd`, for a trace.
         trace_first: First row in the site's table that holds the points of a trace, or the data
             of a CUSTOM model.
         trace_count: Number of these rows.
@@ -115,7 +115,7 @@ class LinkModel(NamedTuple):
     scale: float = 0.0
     extra: float = 0.0
     weight: float = 0.0
-    at_end: int = TraceEnd.HOLD
+    at_end: int = _TraceEnd.HOLD
     trace_first: int = 0
     trace_count: int = 0
     loss_good: float = 0.0
@@ -257,9 +257,9 @@ class LinkModel(NamedTuple):
 
         Args:
             at_end: How the trace continues after its last entry: "hold" or "loop", see
-                `TraceEnd`.
+                `_TraceEnd`.
         """
-        return cls(kind=DelayKind.TRACE, at_end=TraceEnd[at_end.upper()])
+        return cls(kind=DelayKind.TRACE, at_end=_TraceEnd[at_end.upper()])
 
     @property
     def is_random(self) -> bool:
@@ -387,7 +387,7 @@ _NORMAL = int(DelayKind.NORMAL)
 _GAMMA = int(DelayKind.GAMMA)
 _LOG_NORMAL = int(DelayKind.LOG_NORMAL)
 _HYPER = int(DelayKind.HYPER_EXPONENTIAL)
-_LOOP = int(TraceEnd.LOOP)
+_LOOP = int(_TraceEnd.LOOP)
 
 
 @leaf

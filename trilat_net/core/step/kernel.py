@@ -128,7 +128,7 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
         theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
 
-    The rule is explicit, because Y' r does not depend on the estimate. The scheme DIGITAL
+    The rule is explicit, because Y' r does not depend on the estimate. The scheme `digital`
     instead advances the estimate with the Euler method at the end of the tick, in stage 8.
 
     Args:
@@ -348,7 +348,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 
         u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
 
-    At the first tick, and under the scheme DIGITAL, u = tau_k.
+    At the first tick, and under the scheme `digital`, u = tau_k.
 
     Args:
         k: Current tick.
@@ -370,7 +370,7 @@ def hold_motor_torque(k: int, s: SiteRow) -> None:
 def finish_advance(s: SiteRow, chain: RowArray | None, is_adapting: bool) -> None:
     """Stores the torque and the adaptation rate Y' r of this tick for the next tick.
 
-    Y' r drives the parameter estimate; see `_update_estimate`. Under the scheme DIGITAL, this
+    Y' r drives the parameter estimate; see `_update_estimate`. Under the scheme `digital`, this
     function also advances the estimate itself.
 
     Args:

@@ -47,6 +47,7 @@ from .site_setup import SiteSetup
 from .ticks import (
     MAX_ARRIVALS,
     NS_PER_S,
+    RELEASE_REASONS,
     Arrival,
     CoreChange,
     LifeReason,
@@ -439,6 +440,21 @@ class Site:
         Reasons exist only under the rule `glide`, see `session_life`.
         """
         return LifeReason(self._reason.item())
+
+    @property
+    def is_braked(self) -> bool:
+        """True if brakes hold the arm because its dead-man switch was released."""
+        return self.mode is Mode.STOPPED and self.life_reason in RELEASE_REASONS
+
+    @property
+    def awaits_switch(self) -> bool:
+        """True if the arm is stopped only until somebody holds its dead-man switch again."""
+        return self.mode is Mode.STOPPED and self.life_reason is LifeReason.RELEASED
+
+    @property
+    def is_too_far(self) -> bool:
+        """True if the arm does not follow its peers because they are too far away."""
+        return self.life_reason is LifeReason.ALIGN_LIMIT
 
     @property
     def arrays(self) -> SiteArrays:

@@ -89,6 +89,18 @@ class LifeReason(IntEnum):
     RESUMED = 19
     STOP_RELEASED = 20
 
+    @classmethod
+    def of_record(cls, output: TickRecord) -> "LifeReason":
+        """Returns why the arm of a record last changed its mode, for example to HOLD.
+
+        The arm must be under the rule `glide`, as only then does the record contain the reason.
+
+        Args:
+            output: Record of the arm.
+        """
+        shared = len(output.q_des)
+        return cls(int(output.mem[2 * shared + 1]))
+
 
 RELEASE_REASONS = (LifeReason.RELEASED, LifeReason.STOP_RELEASED)
 """Reasons for a stop in which brakes hold the arm because its dead-man switch was released."""
@@ -261,19 +273,6 @@ _REASONS = {
 }
 
 
-def find_life_reason(output: TickRecord) -> LifeReason:
-    """Extracts from a record why an arm last changed its mode, for example from RUN to HOLD.
-
-    The arm must be under the rule `glide`, where it comes to rest while another arm is silent.
-    Only then does the record contain the reason.
-
-    Args:
-        output: Record of the arm.
-    """
-    shared = len(output.q_des)
-    return LifeReason(int(output.mem[2 * shared + 1]))
-
-
 class LifeAlarm(NamedTuple):
     """An alarm that explains why an arm is not following the others, and how to fix it.
 
@@ -427,13 +426,13 @@ def describe_mode(
         t_s = output.t_ns * 1e-9
         return f"{site} diverged at t = {t_s:.3f} s: a joint moves at {speed:.4g} rad/s"
     if glides:
-        reason = find_life_reason(output)
+        reason = LifeReason.of_record(output)
         text = _REASONS.get(reason, "")
     else:
         reason = None
         text = "a peer is stale"
     # The law's error is more informative than the reason that a number is not finite.
-    if law_failure is not None and find_life_reason(output) is LifeReason.NOT_FINITE:
+    if law_failure is not None and LifeReason.of_record(output) is LifeReason.NOT_FINITE:
         text = str(law_failure)
 
     is_regrouped = reason in (LifeReason.DROPPED, LifeReason.RESTORED)

@@ -32,7 +32,7 @@ from ...analysis import (
 )
 from ...core import LINK_PARAMETERS, Array
 from ...execution import SimulatedLog
-from ...log import Log
+from ...log import Log, SiteLog
 from .. import plot_signals, style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
@@ -602,7 +602,7 @@ def _draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
             line_style = style.site_line(log, site, _LOOP_PT)
             errors = site_signals.joint_errors(records)
-            rates = plot_signals.joint_error_rates(records)
+            rates = _compute_error_rates(records)
             joint_count = errors.shape[1]
             for joint, axes in enumerate(panels[:joint_count]):
                 path = np.stack([errors[:, joint], rates[:, joint]], axis=1)
@@ -618,6 +618,25 @@ def _draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             axes.set_ylabel(f"its rate ({rate_unit})")
         style.add_legend(figure, style.site_legend_entries(log, log.sites))
     return figure
+
+
+def _compute_error_rates(records: SiteLog) -> Array:
+    """Returns the velocity error of an arm: its velocity minus that of its reference.
+
+    Args:
+        records: The K records of the arm.
+
+    Returns:
+        Velocity errors of the n joints, in rad/s, shape (K, n). If the arms follow each other's
+        end effectors, the velocity errors of the m task coordinates, shape (K, m).
+    """
+    if records.layout.task:
+        # in task space the column qd_des holds xd_des
+        velocity_error = records.xd - records.qd_des
+        followed_axes = np.array(records.axes)
+        rates: Array = velocity_error * followed_axes
+        return rates
+    return records.qd - records.qd_des
 
 
 def _has_only_chains(log: Log) -> bool:
@@ -774,7 +793,7 @@ def _list_sites_with_walls(log: Log) -> list[str]:
     Args:
         log: Log of the run.
     """
-    return [site for site in log.sites if VirtualWall.list_of_site(log.scenario.sites[site])]
+    return [site for site in log.sites if VirtualWall.list_of_site(log.scenario, site)]
 
 
 @draws(
@@ -799,7 +818,7 @@ def _draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             records = log[site]
             arm_rows = build_arm_rows(log.scenario, site)
             end_effector = arm_rows.place_end_effector(records.q, records.qd)
-            walls = VirtualWall.list_of_site(log.scenario.sites[site])
+            walls = VirtualWall.list_of_site(log.scenario, site)
             for wall_number, wall in enumerate(walls):
                 dashes = style.DASHES[wall_number % len(style.DASHES)]
                 force_n = wall.find_force(records.t_s, end_effector)

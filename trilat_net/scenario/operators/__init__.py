@@ -29,9 +29,7 @@ from ..key_checks import (
     VectorCounts,
     check_choice,
     check_keys,
-    expand_vectors,
     field_names,
-    find_count_problem,
 )
 from ..refusals import MAX_QUOTED_LENGTH
 
@@ -276,7 +274,7 @@ def resolve_operators(
         entry_path = f"{path}[{n}]"
         kind = _find_kind(entry, kinds, entry_path)
         check_keys(entry, ("kind", *field_names(kind)), entry_path)
-        expanded = expand_vectors(entry, kind, held_arm.counts)
+        expanded = held_arm.counts.expand_vectors(entry, kind)
         table = held_arm.draws.draw_numbers(expanded, entry_path)
         kind.complete_table(table, entry, held_arm, entry_path)
         _check_values(
@@ -398,7 +396,7 @@ def _find_refused_key(
         # The location is, for example, ".points[3][1]".
         key, bracket, indices = location.removeprefix(".").partition("[")
         return _RefusedKey(key, bracket + indices)
-    count_problem = find_count_problem(table, kind, counts)
+    count_problem = counts.find_problem(table, kind)
     if count_problem is not None:
         return _RefusedKey(count_problem.key)
     for n, row in enumerate(table.get("points", ())):

@@ -12,7 +12,7 @@ Invariant:
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -350,6 +350,10 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
         return [DIRECTIONS[name] for name in self.frame or FRAMES[axes]]
 
 
+HandMode = Literal["tip", "joint", "force"]
+HAND_MODES = get_args(HandMode)
+
+
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     """Operator who takes hold of the arm during a live session.
 
@@ -386,7 +390,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     is_open: ClassVar[bool] = True
     """True if any member of the session may take hold of the arm."""
 
-    mode: Literal["tip", "joint", "force"] = "tip"
+    mode: HandMode = "tip"
     stiffness_n_m: fields.NotNegativeAxes = (300.0,)
     damping_n_s_m: fields.NotNegativeAxes = (20.0,)
     force_limit_n: fields.Positive = 40.0

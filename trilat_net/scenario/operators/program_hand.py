@@ -155,14 +155,6 @@ class HandSite(NamedTuple):
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
-    def has_separate_process(self) -> bool:
-        """True if the program runs in a separate process in a live session.
-
-        A slow program then does not delay the control loop of the site.
-        """
-        return isinstance(self.spec, ProgramHand) and self.spec.process
-
-    @property
     def source(self) -> str:
         """Identifier by which a site recognises the messages of this program.
 

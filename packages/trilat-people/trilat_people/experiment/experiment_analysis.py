@@ -612,8 +612,8 @@ class ExperimentAnalysis(Result):
             "comparisons.csv": self.to_rows(),
         }
         optional_tables = {
-            "completion_times.csv": _list_rows(self.times),
-            "completion_comparisons.csv": _list_rows(self.time_comparisons),
+            "completion_times.csv": [time._asdict() for time in self.times],
+            "completion_comparisons.csv": [test._asdict() for test in self.time_comparisons],
             "missing_answers.csv": [answers._asdict() for answers in self.missing_answers],
         }
         tables |= {name: rows for name, rows in optional_tables.items() if rows}
@@ -718,8 +718,8 @@ class ExperimentAnalysis(Result):
             "digest": self._experiment.plan.digest,
             "conditions": self._list_means(),
             "comparisons": self.to_rows(),
-            "completion_times": _list_rows(self.times),
-            "completion_comparisons": _list_rows(self.time_comparisons),
+            "completion_times": [time._asdict() for time in self.times],
+            "completion_comparisons": [test._asdict() for test in self.time_comparisons],
             "missing_answers": [answers._asdict() for answers in self.missing_answers],
             "absent": self.absent,
             "mixed_models": models,
@@ -899,17 +899,6 @@ class ExperimentAnalysis(Result):
         alignment = "l" + "r" * len(conditions)
         yield TextTable(("measure", *conditions), rows, align=alignment)
         yield ""
-
-
-def _list_rows(
-    results: Sequence[CompletionTime] | Sequence[CompletionComparison],
-) -> list[dict[str, Any]]:
-    """Converts completion times or their comparisons to table rows for CSV and JSON.
-
-    Returns:
-        One row per condition or comparison, keyed by field name.
-    """
-    return [result._asdict() for result in results]
 
 
 def analyse_experiment(

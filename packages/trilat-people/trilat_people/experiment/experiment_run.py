@@ -25,7 +25,7 @@ from trilat_net.errors import UsageError, count_nouns
 from trilat_net.files import digest_file, make_folder, make_results_folder, write_whole
 from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
-from trilat_net.scenario import parse_scenario
+from trilat_net.scenario import parse_embedded
 from trilat_net.work import (
     Progress,
     RunJournal,
@@ -613,7 +613,7 @@ def open_experiment(folder: str | Path) -> Experiment:
     # The trials are planned again, so that the digest reveals a changed protocol.
     scenarios = {}
     for name, text in stored_plan["scenarios"].items():
-        scenarios[name] = parse_scenario(text, str(folder_path))
+        scenarios[name] = parse_embedded(text, str(folder_path))
     protocol = ExperimentProtocol.read(folder_path / PROTOCOL_FILE)
     plan = ExperimentPlan.of_protocol(protocol, scenarios=scenarios)
     if plan.digest != stored_plan["digest"]:

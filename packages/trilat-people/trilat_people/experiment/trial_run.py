@@ -33,7 +33,7 @@ from trilat_net.execution import FusedRun, record_virtual, verify_log
 from trilat_net.files import digest_file
 from trilat_net.log import Ints, Log, SiteLog, open_log
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import Change, HandPlayer, HandSite, Scenario, parse_scenario
+from trilat_net.scenario import Change, HandPlayer, HandSite, Scenario, parse_embedded
 
 from .movement_measures import energy_j, measure_pair, movement_time_s, path_length_m, sparc
 from .protocol import ExperimentProtocol, PlannedTrial
@@ -648,6 +648,6 @@ class SyntheticTrial(ExperimentTrial):
             LogError: The written log does not reproduce the run.
         """
         protocol, text, planned, digest, folder = task
-        scenario = parse_scenario(text)
+        scenario = parse_embedded(text)
         trial = SyntheticTrial(protocol, scenario, planned, digest)
         return trial.write(folder / planned.file)

@@ -24,7 +24,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 from urllib.parse import parse_qs
 
 import msgspec
@@ -33,20 +33,15 @@ from msgspec import Meta
 from trilat_net.errors import WireError
 from trilat_net.net import (
     Bus,
-    ChangeReply,
+    ChangeQuery,
     ChangeRequest,
     Clock,
     HandSender,
-    Inbox,
-    decode,
-    encode,
     topics,
 )
 
 MAX_MESSAGE_BYTES = 4_096
 """Maximum size of a message from a page."""
-REPLY_TIMEOUT_NS = 3_000_000_000
-"""Maximum time to wait for a site's reply to an order, in ns."""
 MAX_PENDING = 256
 """Maximum number of orders waiting to be sent."""
 TOKEN_BYTES = 16
@@ -532,21 +527,6 @@ class PageHands:
         return sender.boot == source
 
 
-class _OpenQuery(NamedTuple):
-    """A request that was sent to a site and has not been answered yet.
-
-    Attributes:
-        inbox: Inbox that receives the reply.
-        sent_ns: Send time on the monotonic clock, in ns.
-        request: The request, which is resent in an older form if a site with an older version
-            rejects it.
-    """
-
-    inbox: Inbox
-    sent_ns: int
-    request: ChangeRequest
-
-
 class OrderDesk:
     """Sends the requests of all pages to the sites, one at a time, and collects their replies.
 
@@ -574,7 +554,7 @@ class OrderDesk:
         # Requests that wait to be sent, by site and subject.
         self._pending: dict[tuple[str, str], ChangeRequest] = {}
         # Requests that wait for a reply, by site and channel.
-        self._open_queries: dict[tuple[str, str], _OpenQuery] = {}
+        self._open_queries: dict[tuple[str, str], ChangeQuery] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
         if refused is None:
             refused = Counter()
@@ -655,7 +635,7 @@ class OrderDesk:
         for site in sites:
             # A pending release would let the arm move again right after the stop.
             self._pending.pop((site, RELEASE), None)
-            self._send_request(site, topics.STOP, request)
+            self._open_queries[site, topics.STOP] = self._send(site, request)
 
     def _release(self, order: _ReleaseArms, sites: Collection[str], source: str) -> None:
         """Queues requests to release stopped arms, or to reset arms after a fault.
@@ -690,21 +670,9 @@ class OrderDesk:
         if is_replacement or len(self._pending) < MAX_PENDING:
             self._pending[site, subject] = request
 
-    def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
-        """Sends a request to a site. The reply is received by `poll`.
-
-        For example, a request may change the delay of a link or stop an arm. Only one request
-        at a time waits for its reply.
-
-        Args:
-            site: Name of the site.
-            channel: Channel for changes or for stops.
-            request: The request.
-        """
-        key = topics.key(self._session, site, channel)
-        inbox = self._bus.query(key, encode(request))
-        sent_ns = self._clock.monotonic_ns()
-        self._open_queries[site, channel] = _OpenQuery(inbox, sent_ns, request)
+    def _send(self, site: str, request: ChangeRequest) -> ChangeQuery:
+        """Sends a request to a site. The reply is received by `poll`."""
+        return ChangeQuery(self._bus, self._clock, self._session, site, request)
 
     def mark(self, site: str, text: str) -> None:
         """Asks a site to publish an event that marks this moment in the log.
@@ -723,17 +691,19 @@ class OrderDesk:
         A site receives one request at a time, and the next one only after its reply. If a site
         does not reply in time, an entry saying so is added to `replies`.
         """
-        now_ns = self._clock.monotonic_ns()
         # A copy of the items, because answered requests are removed.
         open_queries = list(self._open_queries.items())
         for (site, channel), query in open_queries:
-            reply = query.inbox.poll()
-            waited_ns = now_ns - query.sent_ns
+            try:
+                reply = query.poll()
+            except WireError as error:
+                del self._open_queries[site, channel]
+                self.refused[error.reason] += 1
+                continue
             if reply is not None:
                 del self._open_queries[site, channel]
-                _, payload = reply
-                self._handle_reply(site, channel, query.request, payload)
-            elif waited_ns > REPLY_TIMEOUT_NS:
+                self.replies.append((site, channel, reply.accepted, reply.text))
+            elif query.is_overdue:
                 del self._open_queries[site, channel]
                 problem = f"{site} does not answer"
                 self.replies.append((site, channel, False, problem))
@@ -743,30 +713,7 @@ class OrderDesk:
             waits_for_reply = (site, topics.SET) in self._open_queries
             if not waits_for_reply:
                 del self._pending[site, subject]
-                self._send_request(site, topics.SET, request)
-
-    def _handle_reply(
-        self, site: str, channel: str, request: ChangeRequest, payload: bytes
-    ) -> None:
-        """Stores the reply of a site to a request, to be shown on web pages.
-
-        A rejected stop is resent in an older form: a site that runs an older version does not
-        know the field `source` and rejects the entire request, but its arm must stop too.
-        Replies that cannot be decoded are counted.
-        """
-        try:
-            reply = decode(payload, ChangeReply)
-        except WireError as error:
-            self.refused[error.reason] += 1
-            return
-
-        is_refused_stop = channel == topics.STOP and not reply.accepted
-        has_source = request.source is not msgspec.UNSET
-        if is_refused_stop and has_source:
-            plain_request = msgspec.structs.replace(request, source=msgspec.UNSET)
-            self._send_request(site, channel, plain_request)
-        else:
-            self.replies.append((site, channel, reply.accepted, reply.text))
+                self._open_queries[site, topics.SET] = self._send(site, request)
 
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:

@@ -75,7 +75,7 @@ class _ArmFrames:
         self._site = site
         self._model = scenario.arms[site]
         self._spec = scenario.sites[site]
-        self._walls = VirtualWall.list_of_site(self._spec)
+        self._walls = VirtualWall.list_of_site(scenario, site)
         self._hand = self._spec.find_live_hand()
         limits_nm = np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64)
         joint_count = self._model.counts.joints
@@ -678,7 +678,7 @@ class SessionFrames:
         missing_count = 0
         has_seen_all = site.first_tick == 0
         if has_seen_all:
-            state_account = site.reception.accounts["state"]
+            state_account = site.repair.reception.accounts["state"]
             missing_count = state_account.missing
         # The source is the number of the program that holds the arm at present, or 0.
         is_held = bool(state.get("source"))

@@ -46,7 +46,6 @@ from trilat_net.scenario import (
     LinkTables,
     PictureDelay,
     Scenario,
-    parse_core_change,
     parse_embedded,
 )
 
@@ -123,7 +122,6 @@ class SiteView:
         layout: Numbers of joints and peers in its records, if the site continues without a lost
             peer; otherwise `None`.
         hand: Settings for people who hold its arm, or `None` if nobody can hold it.
-        reception: Tracks which of its messages have arrived.
         window: Its latest records.
         holder: Person or program that last took hold of its arm.
         stopped_by: Person or program that requested its last stop, according to the site's
@@ -131,7 +129,7 @@ class SiteView:
         bodies: Mapping from tick to the poses of the bodies that its arm can touch, as far back
             as `window`.
         dropped: Mapping from reason to number of dropped messages.
-        repair: Requests for its missing messages.
+        repair: Tracks which of its messages have arrived, and requests the missing ones.
         record: Its newest record, or `None` before the first one.
         stats: Its newest statistics, or `None` before the first ones.
         first_tick: Tick of the first record if the observer joined late; otherwise 0.
@@ -160,7 +158,6 @@ class SiteView:
         self.bodies: dict[int, list[float]] = {}
         self.dropped: Counter[str] = Counter()
         self.repair = GapRepair(bus, session, scenario, name, boot, self.dropped)
-        self.reception = self.repair.reception
         self.record: State | None = None
         self.stats: LinkStats | None = None
         self.first_tick = 0
@@ -211,7 +208,7 @@ class SiteView:
     @property
     def ended(self) -> bool:
         """True once the site has published its end, after which it sends no more records."""
-        return self.reception.final_ticks is not None
+        return self.repair.reception.final_ticks is not None
 
     @property
     def complete(self) -> int:
@@ -219,7 +216,7 @@ class SiteView:
 
         No earlier record can still arrive. -1 before the first record.
         """
-        record_account = self.reception.accounts[topics.STATE]
+        record_account = self.repair.reception.accounts[topics.STATE]
         gap = record_account.find_requestable_gap()
         if gap is None:
             return record_account.last
@@ -309,7 +306,9 @@ class SessionView:
         """
         if self._left_ns is None:
             return False
-        arrivals_ns = [site.reception.last_received_ns or 0 for site in self.sites.values()]
+        arrivals_ns = [
+            site.repair.reception.last_received_ns or 0 for site in self.sites.values()
+        ]
         since_ns = max(self._left_ns, *arrivals_ns)
         return self._clock.monotonic_ns() - since_ns > AWAY_NS
 
@@ -329,7 +328,7 @@ class SessionView:
         Args:
             site: The site.
         """
-        received_ns = site.reception.last_received_ns
+        received_ns = site.repair.reception.last_received_ns
         if received_ns is None or site.ended:
             return 0.0
         silence_ns = self._clock.monotonic_ns() - received_ns
@@ -499,9 +498,9 @@ class SessionView:
             return
 
         channel = parts.channel
-        for payload in site.reception.split(channel, block):
+        for payload in site.repair.reception.split(channel, block):
             try:
-                message = site.reception.read(channel, payload)
+                message = site.repair.reception.read(channel, payload)
             except WireError:
                 # Messages of an unknown boot (start of the process) cannot be read. A site that
                 # has been started again announces its new boot with an event.
@@ -509,7 +508,7 @@ class SessionView:
                 if not may_announce_boot or not self._accept_new_boot(parts.member, payload):
                     raise
                 # From now on, messages of the new boot can be read.
-                message = site.reception.read(channel, payload)
+                message = site.repair.reception.read(channel, payload)
 
             has_stored_none = site.record is None and site.stats is None
             is_first = has_stored_none and channel != topics.EVENT
@@ -517,7 +516,7 @@ class SessionView:
                 self._skip_records_before(site, message.content)
 
             # A message that has arrived before, for example on request, is not stored again.
-            is_new = site.reception.accept(channel, message, mono_ns)
+            is_new = site.repair.reception.accept(channel, message, mono_ns)
             if is_new:
                 self._store(parts.member, site, channel, message.content)
 
@@ -545,7 +544,6 @@ class SessionView:
             return False
 
         site.repair = site.repair.follow_start(event.boot)
-        site.reception = site.repair.reception
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
@@ -567,7 +565,7 @@ class SessionView:
 
         site.first_tick = tick
         for channel in (topics.STATE, topics.LINK):
-            account = site.reception.accounts[channel]
+            account = site.repair.reception.accounts[channel]
             account.abandon_below(tick)
         site.repair.probe()
 
@@ -656,7 +654,7 @@ class SessionView:
         self._applied_changes.add(identity)
 
         try:
-            change = parse_core_change(self.scenario, site, text)
+            change = self.scenario.parse_core_change(site, text)
         except ScenarioError:
             self.dropped["no change"] += 1
             return

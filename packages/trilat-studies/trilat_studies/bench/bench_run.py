@@ -388,7 +388,7 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
 
         tip = arm.place_end_effector(record.q, record.qd)
         t_s = record.t_ns / NS_PER_S
-        walls = VirtualWall.list_of_site(spec)
+        walls = VirtualWall.list_of_site(scenario, name)
         wall_forces += [wall.find_force(t_s, tip) for wall in walls]
 
     # There are no maxima if the task has no wall.
@@ -550,7 +550,7 @@ def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> floa
     tip = build_arm_rows(scenario, SLAVE).place_end_effector(record.q, record.qd)
     t_s = record.t_ns / NS_PER_S
     contact_times_s = []
-    for wall in VirtualWall.list_of_site(scenario.sites[SLAVE]):
+    for wall in VirtualWall.list_of_site(scenario, SLAVE):
         touching = np.flatnonzero(wall.find_force(t_s, tip) > 0.0)
         if len(touching):
             contact_times_s.append(float(t_s[touching[0]]))

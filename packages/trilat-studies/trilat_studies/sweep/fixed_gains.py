@@ -11,9 +11,7 @@ Invariant:
 
 from collections.abc import Iterator
 
-import msgspec
-
-from trilat_net.scenario import Scenario, describe_value
+from trilat_net.scenario import Scenario
 
 from .sweep_plan import SweepPlan
 
@@ -69,15 +67,11 @@ def _format_gains(plan: SweepPlan, scenario: Scenario, site: str) -> Iterator[st
         scenario: Scenario of the sweep with one of its laws.
         site: Name of the site.
     """
-    user_law = scenario.user_laws.get(site)
-    if user_law is None:
-        settings = msgspec.to_builtins(scenario.sites[site].control)
-    else:
-        settings = user_law.read_default_settings() | user_law.settings
     swept_keys = {axis.key for axis in plan.axes}
-    for key, value in settings.items():
+    gains = scenario.sites[site].describe_gains(with_defaults=True)
+    for key, text in gains.items():
         common_key = f"control.{key}"
         site_key = f"sites.{site}.control.{key}"
         is_swept = common_key in swept_keys or site_key in swept_keys
-        if key != "law" and not is_swept:
-            yield f"{key} {describe_value(value)}"
+        if not is_swept:
+            yield f"{key} {text}"

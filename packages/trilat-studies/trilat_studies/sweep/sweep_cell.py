@@ -30,7 +30,7 @@ from trilat_net.analysis import (
 )
 from trilat_net.execution import FusedRun
 from trilat_net.results import finite_or_none
-from trilat_net.scenario import Scenario, parse_scenario
+from trilat_net.scenario import Scenario, parse_embedded
 
 
 class CellClass(StrEnum):
@@ -337,7 +337,7 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
         longest_s: Longest duration of the run, in s. The run is not extended if this is no
             longer than its initial duration.
     """
-    cell = _CellInProgress(parse_scenario(text), longest_s)
+    cell = _CellInProgress(parse_embedded(text), longest_s)
     cell.run.advance_to(cell.duration_s)
     cell.note_first_end()
     while (end_s := cell.find_next_end()) is not None:

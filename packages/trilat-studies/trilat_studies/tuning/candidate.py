@@ -58,7 +58,7 @@ from trilat_net.scenario import (
     END_WINDOW_S,
     ExperimentText,
     Scenario,
-    parse_scenario,
+    parse_embedded,
 )
 from trilat_net.work import MeanInterval
 
@@ -497,8 +497,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
         Returns:
             The score of the candidate.
         """
-        run = _measure_run(parse_scenario(text))
-        twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
+        run = _measure_run(parse_embedded(text))
+        twin = run if twin_text is None else _measure_run(parse_embedded(twin_text))
         return _score_candidate(run, twin)
 
 
@@ -912,7 +912,7 @@ class CandidateItem(NamedTuple):
             for text in texts
             if text
         ]
-        scenarios = {text: parse_scenario(text) for text in dict.fromkeys(texts)}
+        scenarios = {text: parse_embedded(text) for text in dict.fromkeys(texts)}
         measured = {}
         obstacles = {}
         chosen = list(scenarios)

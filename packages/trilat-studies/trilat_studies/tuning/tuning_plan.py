@@ -33,7 +33,7 @@ from trilat_net.execution import FusedRun
 from trilat_net.net import SystemClock
 from trilat_net.own_code import name_law_classes
 from trilat_net.results import Result
-from trilat_net.scenario import Scenario, parse_scenario
+from trilat_net.scenario import Scenario, parse_embedded
 from trilat_net.work import Progress, WorkerPool, Workers
 
 from ..side_by_side import RunKind, prepare_kinds
@@ -552,7 +552,7 @@ class TuningPlan(NamedTuple):
         """
         kinds = {}
         for space, first in zip(self.spaces, first_candidates, strict=True):
-            scenario = parse_scenario(first.runs[0][0])
+            scenario = parse_embedded(first.runs[0][0])
             kinds[space.law] = RunKind(scenario, self.budget * len(first.runs))
         return prepare_kinds(kinds)
 

@@ -16,13 +16,13 @@ from trilat_net.analysis.link_summary import ClockSummary
 from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.net.messages import Event, LinkStats
-from trilat_net.presentation import summary_text
-from trilat_net.presentation.page_summary import render_alarms
-from trilat_net.presentation.result_text import TextTable
-from trilat_net.presentation.summary_text import (
+from trilat_net.presentation import log_text
+from trilat_net.presentation.log_text import (
     MOST_LINE_CHARACTERS,
     format_run_lines,
 )
+from trilat_net.presentation.page_summary import render_alarms
+from trilat_net.presentation.result_text import TextTable
 
 
 def list_lines(log, start):
@@ -109,7 +109,7 @@ def test_foreign_records_raise_no_alarm(mem):
 
 
 def test_of_many_lines_the_first_are_shown(monkeypatch):
-    monkeypatch.setattr(summary_text, "MOST_LINES", 2)
+    monkeypatch.setattr(log_text, "MOST_LINES", 2)
     log = make_busy_run().log
     assert len(list_lines(log, "link ")) == 2
     assert "and 4 more of this kind: see summary.json" in format_run_lines(log)
