@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import trilat_net as tn
+from trilat_net.analysis.twins import twin_runs as twins
 from trilat_net.core.lanes import twin_lanes
 from trilat_net.core.lanes.lane_rows import LANES
 from trilat_net.core.lanes.lane_run import LaneRun
-from trilat_net.execution import twins
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 

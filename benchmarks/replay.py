@@ -18,7 +18,7 @@ from trilat_net.execution import virtual
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.membership import liveliness_token, new_boot
+from trilat_net.net.membership import new_boot
 from trilat_net.net.messages import Event, Info
 from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import ZenohBus
@@ -75,7 +75,7 @@ def subscribe(endpoint: str) -> None:
     bus.tap(topics.key(SESSION, "*", topics.EVENT), stored)
     info = _info(boot)
     bus.respond(topics.key(SESSION, topics.RECORDER, topics.INFO), lambda _: encode(info))
-    bus.announce(liveliness_token(SESSION, topics.RECORDER, boot))
+    bus.announce(topics.presence_token(SESSION, topics.RECORDER, boot))
     clock = SystemClock()
     while not ended[0]:
         clock.sleep_until(clock.monotonic_ns() + 50_000_000)

@@ -29,7 +29,6 @@ from trilat_net.net import (
     Epoch,
     EventPublisher,
     SessionJoin,
-    connect_to_session,
     describe_member,
     new_boot,
     share_threads,
@@ -363,7 +362,7 @@ def record_session(
     Args:
         session: Name of the session.
         storage: Place where the log (an MCAP file) is written.
-        connection: How to connect to the session, see `connect_to_session`.
+        connection: How to connect to the session, see `Connection.open_session`.
         read_scenario: Function that parses the text of the session's scenario.
         collect_provenance: Function that returns the information about this program that is
             stored in the log. It is called once the recorder is connected.
@@ -388,8 +387,7 @@ def record_session(
     with ExitStack() as stack:
         interrupt = stack.enter_context(Interrupt())
         bus = stack.enter_context(
-            connect_to_session(
-                connection,
+            connection.open_session(
                 clock,
                 session,
                 lambda text: read_scenario(text, session)[0].names,

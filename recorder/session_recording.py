@@ -112,12 +112,11 @@ class Recording:
             )
             for name in scenario.names
         }
-        self._sites = {name: repair.reception for name, repair in self._repairs.items()}
         # Site and channel of each key.
         self._channels = {
-            topics.key(session, name, channel): (site, channel)
-            for name, site in self._sites.items()
-            for channel in site.accounts
+            topics.key(session, name, channel): (repair.reception, channel)
+            for name, repair in self._repairs.items()
+            for channel in repair.reception.accounts
         }
         # Keys under which sites publish blocks of records.
         self._block_keys = {
@@ -152,7 +151,7 @@ class Recording:
             now_ns: Present time on the monotonic clock, in ns.
         """
         since_epoch_ns = now_ns - self.epoch.mono_ns
-        present_sites = [name for name in self._sites if name not in self._gone_sites]
+        present_sites = [name for name in self._repairs if name not in self._gone_sites]
         self.publisher.publish(
             "late",
             f"the recorder joins at t = {since_epoch_ns / 1e9:.3f} s; "
@@ -170,7 +169,7 @@ class Recording:
         A recorder that joins a running session cannot know which sites have already left. If it
         expected messages from such a site, it would wait forever.
         """
-        self._gone_sites = set(self._sites)
+        self._gone_sites = set(self._repairs)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
         """Writes the messages that have arrived to the log, and requests missing messages.
@@ -187,7 +186,8 @@ class Recording:
         self._admit_starts()
         for name, repair in list(self._repairs.items()):
             self._repair_gaps(name, repair, now_ns)
-        for name, site in self._sites.items():
+        for name, repair in self._repairs.items():
+            site = repair.reception
             if site.is_complete and name not in self._stored_sites:
                 self._stored_sites.add(name)
                 self._publish_stored(site, now_ns)
@@ -222,7 +222,7 @@ class Recording:
         """
         since_epoch_ns = now_ns - self.epoch.mono_ns
         # The reception uses this time to judge whether a message is from the future.
-        self._sites[name].since_ns = since_epoch_ns
+        repair.reception.since_ns = since_epoch_ns
         gone_since_ns = self._update_gone_since_ns(name, now_ns)
         # If a message arrived after the site was reported as gone, the site can still reply.
         is_present = gone_since_ns is None or gone_since_ns > self._noticed_gone_ns[name]
@@ -289,7 +289,7 @@ class Recording:
         `_next_boots`.
         """
         for name, boot in list(self._next_boots.items()):
-            previous = self._sites[name]
+            previous = self._repairs[name].reception
             has_left = name in self._gone_sites or name not in self._recorded_boots
             has_ended = previous.final_ticks is not None
             is_admitted = boot in self._admitted_boots
@@ -302,7 +302,6 @@ class Recording:
             repair = self._repairs[name].follow_start(boot)
             repair.probe()
             site = repair.reception
-            self._sites[name] = site
             self._repairs[name] = repair
             for channel in site.accounts:
                 key = topics.key(self.session, name, channel)
@@ -332,13 +331,9 @@ class Recording:
         Raises:
             WireError: The message is not an event.
         """
-        event = decode(payload, Event)
-        is_announcement = event.kind in ("coming", "join") and event.member == name
-        if not is_announcement:
-            return
-        names_own_boot = event.boots.get(name) == event.boot
-        if names_own_boot and self._scenario.sites_may_return:
-            self._next_boots[name] = event.boot
+        boot = self._repairs[name].reception.find_new_boot(payload, ("coming", "join"))
+        if boot is not None:
+            self._next_boots[name] = boot
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
@@ -357,14 +352,14 @@ class Recording:
             event: Any decoded message of a site. All messages other than these events are
                 ignored.
         """
-        if not isinstance(event, Event) or event.about not in self._sites:
+        if not isinstance(event, Event) or event.about not in self._repairs:
             return
 
         restarted_site = event.about
         boot = event.boots.get(restarted_site)
         is_recorded = boot == self._recorded_boots.get(restarted_site)
         if event.kind == LAST and is_recorded:
-            self._sites[restarted_site].count_previous_start(event.ticks)
+            self._repairs[restarted_site].reception.count_previous_start(event.ticks)
         is_new_admission = event.kind == "admit" and boot is not None and not is_recorded
         if not is_new_admission:
             return
@@ -519,7 +514,7 @@ class Recording:
             alive: True if the token appeared, False if it disappeared.
         """
         token = topics.parse_key(key)
-        if token is None or token.member not in self._sites:
+        if token is None or token.member not in self._repairs:
             return
 
         recorded_boot = str(self._recorded_boots.get(token.member))  # keys contain text
@@ -556,7 +551,7 @@ class Recording:
             self._noticed_gone_ns.pop(site, None)
             return None
         noticed_ns = self._noticed_gone_ns.setdefault(site, now_ns)
-        last_message_ns = self._sites[site].last_received_ns
+        last_message_ns = self._repairs[site].reception.last_received_ns
         if last_message_ns is None or last_message_ns < noticed_ns + _UNDER_WAY_NS:
             return noticed_ns
         return last_message_ns
@@ -572,7 +567,7 @@ class Recording:
         """
         # Every site is examined, because `_has_left` notes the time at which a site
         # disappeared.
-        have_left = [self._has_left(name, now_ns) for name in self._sites]
+        have_left = [self._has_left(name, now_ns) for name in self._repairs]
         return all(have_left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
@@ -592,7 +587,7 @@ class Recording:
         if absent_since_ns is None:  # the site is present
             return False
 
-        reception = self._sites[site]
+        reception = self._repairs[site].reception
         has_ended = reception.final_ticks is not None
         if not has_ended:
             # The connection may have been cut, so the site may return. There is no reason to
@@ -631,9 +626,10 @@ class Recording:
             True if every site has left, or is running with no missing messages.
         """
         may_be_in_transit = now_ns - ending_ns <= SETTLE_NS
-        for name, site in self._sites.items():
+        for name, repair in self._repairs.items():
             if self._has_left(name, now_ns):
                 continue
+            site = repair.reception
             silence_ns = now_ns - (site.last_received_ns or 0)
             is_running = site.final_ticks is None and silence_ns < _HEARD_NS
             if not is_running:
@@ -677,9 +673,9 @@ class Recording:
         """
         # Counts of the events of earlier starts of a site, by key.
         event_accounts = {}
-        for name, site in self._sites.items():
+        for name, repair in self._repairs.items():
             event_key = topics.key(self.session, name, topics.EVENT)
-            event_accounts[event_key] = site.event_accounts
+            event_accounts[event_key] = repair.reception.event_accounts
         texts = {}
         for key, account in self.accounts.items():
             earlier_accounts = event_accounts.get(key, ())
@@ -696,7 +692,7 @@ class Recording:
         There is one line per site with the numbers of its records, and one line for each reason
         why messages were not written.
         """
-        lines = [self._summarize_site(site) for site in self._sites.values()]
+        lines = [self._summarize_site(repair.reception) for repair in self._repairs.values()]
         if self._overflowed:
             messages_text = count_nouns(self._overflowed, "message")
             lines.append(f"recorder: {messages_text} dropped because the queue was full")
@@ -742,7 +738,8 @@ class Recording:
             A sentence about a site that disappeared or whose messages are missing, or None if
             there is no problem.
         """
-        for name, site in self._sites.items():
+        for name, repair in self._repairs.items():
+            site = repair.reception
             if site.final_ticks is None:
                 records_text = count_nouns(site.accounts[topics.STATE].received, "record")
                 return f"{name} disappeared after {records_text}"

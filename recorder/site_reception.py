@@ -20,7 +20,7 @@ Invariant:
 import math
 import threading
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import NamedTuple
 
 from trilat_net.errors import WireError, count_nouns
@@ -40,6 +40,7 @@ from trilat_net.net import (
     State,
     count_messages,
     count_under_way,
+    decode,
     make_decoder,
     number_message,
     skipped_numbers,
@@ -249,6 +250,7 @@ class SiteReception:
         self.final_ticks: int | None = None
         self.last_received_ns: int | None = None
         self._boot = boot
+        self._may_return = scenario.sites_may_return
         self._ticks = scenario.ticks(name)
         self._rate_hz = scenario.sites[name].rate_hz
         self.period_ns = 1_000_000_000 // self._rate_hz
@@ -341,6 +343,29 @@ class SiteReception:
         self._reserve_event_bytes(event, len(payload))
         return SiteMessage(event.n, event.n, event.t_ns, event)
 
+    def find_new_boot(self, payload: bytes, kinds: Collection[str]) -> int | None:
+        """Returns the boot of the next start of the site, if an event announces this start.
+
+        Each start of a site is identified by a random number, its boot. Messages with an
+        unknown boot are rejected until an event announces that the new process exists.
+
+        Args:
+            payload: The encoded event.
+            kinds: Kinds of events that announce a start: "coming" before the site has been
+                admitted to the session, "join" afterwards.
+
+        Returns:
+            The boot, or None if the event announces no start of this site, or if sites may not
+            return to the session.
+
+        Raises:
+            WireError: The message is not an event.
+        """
+        event = decode(payload, Event)
+        is_announcement = event.kind in kinds and event.member == self.name
+        names_own_boot = event.boots.get(self.name) == event.boot
+        return event.boot if is_announcement and names_own_boot and self._may_return else None
+
     def _check(self, channel: str, sender: str, boot: int, number: int, ticks: int) -> None:
         """Raises WireError if a message is from another sender or start, or implausible.
 
@@ -398,13 +423,13 @@ class SiteReception:
             WireError: A payload is not a valid record of this site. The records before it have
                 been counted.
         """
-        decode = self._decoders[topics.STATE]
+        decode_record = self._decoders[topics.STATE]
         account = self.accounts[topics.STATE]
         name = self.name
         boot = self._boot
         possible_ticks = self._possible_ticks
         for payload in payloads:
-            record: State = decode(payload)
+            record: State = decode_record(payload)
             tick = record.tick
             if tick >= possible_ticks or record.site != name or record.boot != boot:
                 # Determines which condition the record violates, and raises the error.

@@ -44,14 +44,14 @@ from trilat_net.analysis.theory import (
     linear_edge,
     port_response,
 )
-from trilat_net.analysis.twins import envelope_trend, twin_growth
+from trilat_net.analysis.twins import envelope_trend, twin_growth, twin_runs
 from trilat_net.app import machine_load
 from trilat_net.app.play import player
 from trilat_net.core.life import live_hand, session_life
 from trilat_net.core.links import delay, link
 from trilat_net.core.plug import user_law
 from trilat_net.core.step import site_arrays, ticks
-from trilat_net.execution import twins, verification
+from trilat_net.execution import verification
 from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
@@ -99,10 +99,10 @@ STATED: list[tuple[str, str, float, float]] = [
         1088,
         bench_plan.TUNED_ROUND_TRIPS_MS[-1],
     ),
-    ("twins.md", "end of each of 16 windows", 16, twins.WINDOWS),
-    ("twins.md", "a difference above 1e-4 is made small again", 1e-4, twins.LARGEST),
-    ("twins.md", "a run within 1e-7 of its records has twins", 1e-7, twins.SAME_RUN),
-    ("twins.md", "A difference below 1e-12 is rounding", 1e-12, twins.SMALLEST),
+    ("twins.md", "end of each of 16 windows", 16, twin_runs.WINDOWS),
+    ("twins.md", "a difference above 1e-4 is made small again", 1e-4, twin_runs.LARGEST),
+    ("twins.md", "a run within 1e-7 of its records has twins", 1e-7, twin_runs.SAME_RUN),
+    ("twins.md", "A difference below 1e-12 is rounding", 1e-12, twin_runs.SMALLEST),
     ("stability.md", "(`FLOOR_RAD`, 1e-12)", 1e-12, envelope_trend.FLOOR_RAD),
     ("data/summary-numbers.csv", "exceeds 0.01 rad", 0.01, site_signals.SETTLED_ERROR_RAD),
     ("design.md", "at most 200 ppm", 200.0, timing.SLEW_LIMIT / 1e3),
@@ -216,7 +216,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("observed-energy.md", "at most 1 % of", 1, 100 * observed_energy.SAMPLING_SHARE),
     ("stability.md", "within 0.02 rad of that rest", 0.02, stability_decision.NEAR_REST_RAD),
     ("data/push-rules.csv", "fewer than 100 bursts", 100, stability_decision.LEAST_BURSTS),
-    ("twins.md", "at most 32", 32, twins.MAX_PUSHES),
+    ("twins.md", "at most 32", 32, twin_runs.MAX_PUSHES),
     ("twins.md", "for 5 s or more", 5, twin_growth.LEAST_LEFT_S),
     ("sweep.md", "eight times the duration", 8, sweep_plan.MAX_EXTENSION),
     ("data/sweep-ends.csv", "by more than 2 %", 2, 100 * sweep_cell.FLAT_LOG_CHANGE),

@@ -514,7 +514,7 @@ PAGES: dict[str, dict[str, Make]] = {
     },
 }
 CERTIFIED = (
-    "hands gave: {} J at 0 s, {} J at {} s",
+    "hands supplied: {} J at 0 s, {} J at {} s",
     "a small disturbance halves every {} s",
     "converged: largest |e| {} rad of m1 joint 1 and |qd| {} rad/s of m2 joint 1 in the last second",
     "closes to {} of the largest energy, {} J; to {} once",

@@ -9,7 +9,7 @@ from trilat_net.analysis.run_end import EndBehaviour, EndDoubt, RunEnd, Stabilit
 from trilat_net.analysis.stability_decision import LoopRoots, RunFindings, StabilityDecision
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, RestDeparture, TwinGrowth
-from trilat_net.execution.twins import Push
+from trilat_net.analysis.twins.twin_runs import Push
 from trilat_net.presentation.verdict_text import THEOREM
 from trilat_net.scenario import load_scenario
 

@@ -14,7 +14,7 @@ from trilat_net.analysis.twins.twin_growth import (
     PushGrowth,
     TwinGrowth,
 )
-from trilat_net.execution.twins import Push, TwinPath, Twins
+from trilat_net.analysis.twins.twin_runs import Push, TwinPath, Twins
 from trilat_net.scenario import load_scenario
 
 TWO = load_scenario("two_sites")

@@ -7,6 +7,7 @@ import pytest
 
 from tests.execution.builders import run_fused
 from trilat_net.analysis import judge
+from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.log import Log
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -20,17 +21,15 @@ def count_recordings(
     """Returns how often a run was recorded to judge it, and the judgement."""
     recorded: list[str] = []
 
-    def count(name: str) -> Callable[[Scenario], Log]:
-        simulate: Callable[[Scenario], Log] = getattr(judge, name)
-
+    def count(simulate: Callable[[Scenario], Log]) -> Callable[[Scenario], Log]:
         def simulate_and_count(scenario: Scenario) -> Log:
-            recorded.append(name)
+            recorded.append(scenario.name)
             return simulate(scenario)
 
         return simulate_and_count
 
-    for function in ("SimulatedLog", "simulate_columns"):
-        monkeypatch.setattr(judge, function, count(function))
+    monkeypatch.setattr(judge, "SimulatedLog", count(SimulatedLog))
+    monkeypatch.setattr(FusedRun, "simulate_log", count(FusedRun.simulate_log))
     scenario = load_scenario(name, settings)
     run = run_fused(scenario)
     decision = judge.VirtualRun(scenario, run).decision

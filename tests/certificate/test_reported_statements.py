@@ -14,7 +14,7 @@ from tests.certificate.sampled_loops import make_constant_delay, make_sine_delay
 from tests.unit_arm import make_unit_scenario
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.run_end import Stability
-from trilat_net.execution.twins import Push, Twins
+from trilat_net.analysis.twins.twin_runs import Push, Twins
 from trilat_net.presentation.observed_text import NEGATIVE_ENERGY_MEANING
 from trilat_net.scenario import Scenario, load_scenario
 

@@ -192,5 +192,5 @@ def make_external_arm_bytes() -> bytes:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(virtual, "execute_virtual", execute_measured)
-        patch.setattr(virtual, "check_virtual", lambda *_, **__: None)
+        patch.setattr(virtual.SimulatedLog, "check_scenario", lambda *_, **__: None)
         return simulate_bytes(scenario)

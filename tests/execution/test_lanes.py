@@ -12,8 +12,8 @@ import pytest
 
 from tests.execution.varying_links import LINKS
 from trilat_net.core.lanes.lane_rows import LANES
-from trilat_net.core.lanes.lane_run import LaneRun, read_assembly
-from trilat_net.core.lanes.lane_structure import find_obstacle
+from trilat_net.core.lanes.lane_run import LaneRun
+from trilat_net.core.lanes.lane_structure import RunStructure
 from trilat_net.core.lanes.run_groups import LEAST_RUNS, RunGroup
 from trilat_net.core.step.row_fields import FIELDS
 from trilat_net.errors import LawFailed
@@ -259,8 +259,8 @@ def test_only_the_run_whose_law_fails_ends() -> None:
 )
 def test_obstacles_are_named(name: str, settings: dict[str, Any], obstacle: str) -> None:
     run = FusedRun(load_scenario(name, {"duration_s": 0.1, **settings}))
-    assert bool(obstacle) == bool(find_obstacle(run))
-    assert obstacle in find_obstacle(run)
+    assert bool(obstacle) == bool(RunStructure.find_obstacle(run))
+    assert obstacle in RunStructure.find_obstacle(run)
 
 
 def test_groups_share_structure_and_small_groups_split() -> None:
@@ -293,7 +293,8 @@ def _has_avx2() -> bool:
 @pytest.mark.parametrize("settings", [{}, {"on_stale": GLIDE}], ids=["use", "glide"])
 def test_stages_use_vector_instructions(settings: dict[str, Any]) -> None:
     """A single branch in a leaf would cost a factor of four: stage 8 alone divides eight times."""
-    code = read_assembly(FusedRun(load_scenario("free", {"duration_s": 0.1, **settings})), 0)
+    run = FusedRun(load_scenario("free", {"duration_s": 0.1, **settings}))
+    code = LaneRun.list_code(run)[0].read_assembly()
     packed = {
         name: len(re.findall(rf"\bv{name}pd\b[^\n]*[yz]mm", code))
         for name in ("add", "sub", "mul", "div", "max", "sqrt")

@@ -14,7 +14,7 @@ import zstandard
 
 from tests.log.builders import edit_log_bytes
 from trilat_net.analysis.file_overview import info
-from trilat_net.app.play.session_reader import PlaySelection, preload_messages
+from trilat_net.app.play.session_reader import PlaySelection, SessionReader
 from trilat_net.errors import TrilatError
 from trilat_net.execution.verification import verify_log
 from trilat_net.log.log_reader import open_log
@@ -347,7 +347,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "info": lambda path: info(path).facts,
     "check": lambda path: check_file(path),
     "recover": _recover,
-    "replay": lambda path: preload_messages([path], PlaySelection(), 64 << 20),
+    "replay": lambda path: SessionReader([path], PlaySelection()).preload(64 << 20),
 }
 """The readers of logs, by name."""
 

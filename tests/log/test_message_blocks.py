@@ -14,7 +14,8 @@ from tests.log.builders import edit_log_bytes, make_log_bytes
 from tests.log.hostility import CHANGES, mangle_log
 from trilat_net.errors import LogError
 from trilat_net.log import mcap_reader
-from trilat_net.log.mcap_reader import ChannelMessages, McapReader
+from trilat_net.log.log_contents import ChannelMessages
+from trilat_net.log.mcap_reader import McapReader
 
 WHOLE = make_log_bytes("paper")
 MANY_CHUNKS = edit_log_bytes(WHOLE, chunk_bytes=8192)

@@ -73,8 +73,8 @@ def test_only_recent_blocks_are_held() -> None:
 
 
 def test_few_records_are_a_list() -> None:
-    assert isinstance(site_log.decode_records([b"1"] * 8, decode_ticks), list)
-    assert isinstance(site_log.decode_records([b"1"] * 9, decode_ticks), LazyRecords)
+    assert isinstance(LazyRecords.decode_short([b"1"] * 8, decode_ticks), list)
+    assert isinstance(LazyRecords.decode_short([b"1"] * 9, decode_ticks), LazyRecords)
 
 
 @pytest.mark.parametrize("field", ["rx", "echo", "cmd", "mem", "used"])
@@ -83,9 +83,13 @@ def test_long_records_are_held_few_at_once(field: str, monkeypatch: pytest.Monke
     monkeypatch.setattr(site_log, "HEAVY_BYTES", 9_000)
     values = {f"m{n}": n for n in range(300)} if field == "used" else [0] * 300
     heavy = msgspec.structs.replace(EMPTY, **{field: values})
-    assert isinstance(site_log.decode_records([b""] * 2, lambda _: [EMPTY, EMPTY]), list)
-    assert isinstance(site_log.decode_records([b""] * 2, lambda _: [heavy, EMPTY]), LazyRecords)
-    assert isinstance(site_log.decode_records([b""] * 2, lambda _: [EMPTY, heavy]), LazyRecords)
+    assert isinstance(LazyRecords.decode_short([b""] * 2, lambda _: [EMPTY, EMPTY]), list)
+    assert isinstance(
+        LazyRecords.decode_short([b""] * 2, lambda _: [heavy, EMPTY]), LazyRecords
+    )
+    assert isinstance(
+        LazyRecords.decode_short([b""] * 2, lambda _: [EMPTY, heavy]), LazyRecords
+    )
 
 
 @given(st.lists(st.integers(0, 20), max_size=20).map(sorted))

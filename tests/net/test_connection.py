@@ -14,8 +14,8 @@ from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError, UsageError
 from trilat_net.net.connection import (
     Connection,
-    DefaultEndpoints,
 )
+from trilat_net.net.default_endpoints import DefaultEndpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.net.zenoh_config import ZenohFile
 

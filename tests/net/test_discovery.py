@@ -14,9 +14,9 @@ from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
 from trilat_net.net import session_members, topics
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.connection import Connection, DefaultEndpoints
-from trilat_net.net.discovery import connect_to_session
-from trilat_net.net.membership import EventPublisher, liveliness_token
+from trilat_net.net.connection import Connection
+from trilat_net.net.default_endpoints import DefaultEndpoints
+from trilat_net.net.membership import EventPublisher
 from trilat_net.net.messages import VERSION, Info
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.session_members import SessionMembers
@@ -129,6 +129,29 @@ def test_members_are_found_despite_unreadable_answers() -> None:
     assert find_answering() == []
 
 
+def test_a_new_search_ignores_earlier_replies() -> None:
+    """A second search on the same object neither yields nor reports replies to the first one."""
+    network = LocalNetwork()
+    members = SessionMembers(network.join(), ManualClock(), SESSION)
+
+    def search() -> Iterator[Info]:
+        return members.find(stopped=lambda: False, timeout_s=0.5)
+
+    garbled = network.join()
+    garbled.respond(topics.key(SESSION, "m0", topics.INFO), lambda _: b"garbage")
+    with pytest.raises(SessionError, match="the reply of m0 cannot be read"):
+        list(search())
+    garbled.close()
+    answering = network.join()
+    for name in ("m1", "m2"):
+        reply = encode(answer_info(name, 1))
+        answering.respond(topics.key(SESSION, name, topics.INFO), lambda _, sent=reply: sent)
+    assert next(search()).member == "m1"
+    answering.close()
+    assert list(search()) == []
+    assert members.unreadable == {}
+
+
 def test_answers_of_other_versions_name_their_member() -> None:
     with pytest.raises(
         SessionError, match=f"the reply of m0 cannot be read: .* version {VERSION + 1}"
@@ -147,10 +170,13 @@ def test_waiting_recorders_announce_themselves_first() -> None:
     nowhere = Connection(connect=None)
     with (
         closing(first),
-        connect_to_session(
-            nowhere, CLOCK, session, lambda text: parse_scenario(text).names, **patience
+        nowhere.open_session(
+            CLOCK, session, lambda text: parse_scenario(text).names, **patience
         ) as bus,
     ):
         assert bus is not None
-        assert until(presence.poll) == (liveliness_token(session, topics.RECORDER, 7), True)
+        assert until(presence.poll) == (
+            topics.presence_token(session, topics.RECORDER, 7),
+            True,
+        )
         assert presence.poll() is None  # it stays announced

@@ -17,7 +17,6 @@ from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
 from trilat_net.net.bus import BoundedRing
-from trilat_net.net.membership import read_messages
 from trilat_net.net.messages import (
     MOST_PEERS,
     READABLE,
@@ -39,6 +38,7 @@ from trilat_net.net.wire import (
     encode_sample,
     encode_state,
     join_states,
+    read_messages,
     split_states,
 )
 

@@ -22,7 +22,8 @@ from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, TwinGrowth
-from trilat_net.execution.twins import Push
+from trilat_net.analysis.twins.twin_runs import Push
+from trilat_net.log.findings import CheckReport
 from trilat_net.presentation.certificate_text import (
     describe_certificate,
     describe_in_words,
@@ -191,7 +192,7 @@ def test_settled_runs_state_their_speed(behaviour: EndBehaviour) -> None:
     assert certificate.stability is Stability.SETTLED
     text = " ".join(line.text for line in describe_in_words(certificate))
     assert "no joint was faster than 0.0043 rad/s at the end" in text
-    verdict = render_verdict(make_short_log("paper"), certificate, [])
+    verdict = render_verdict(make_short_log("paper"), certificate, CheckReport([]))
     assert "no joint was faster than 0.0043 rad/s" in verdict
     assert "came to rest" not in f"{certificate.headline()} {text} {verdict}"
 

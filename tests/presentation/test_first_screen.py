@@ -11,7 +11,7 @@ from tests.live.browsers import needs_browser
 from tests.page.whole_pages import grave_findings, watched_page
 from trilat_net import presentation
 from trilat_net.analysis.certificate.stability_certificate import Certificate
-from trilat_net.log.findings import Finding
+from trilat_net.log.findings import CheckReport, Finding
 from trilat_net.presentation.appearance import DARK_SITE_COLOURS, SITE_COLOURS
 from trilat_net.presentation.page import write_report
 
@@ -26,7 +26,9 @@ NAMES = [
     pytest.param("six joints", marks=pytest.mark.long),
     pytest.param("no record", marks=pytest.mark.long),
 ]
-CHECKS = [Finding("records", "all present"), Finding("executed again", "differs", False)]
+CHECKS = CheckReport(
+    [Finding("records", "all present"), Finding("executed again", "differs", False)]
+)
 UNFOLD = "document.querySelectorAll('details').forEach((part) => { part.open = true; })"
 
 
@@ -41,7 +43,10 @@ def test_report_fits_screens_and_axe_finds_nothing(
     name: str, browser: Browser, tmp_path: Path
 ) -> None:
     log = VARIED[name]()
-    path, _ = write_report(log, tmp_path, certificate=Certificate.of_log(log), verdicts=CHECKS)
+    certificate = Certificate.of_log(log)
+    path, _ = write_report(
+        log, tmp_path, certificate=certificate, wait_for_checks=lambda: CHECKS
+    )
     has_records = any(len(log[site]) for site in log.sites)
     for screen, (width, height) in SCREENS.items():
         for scheme in ("light", "dark"):

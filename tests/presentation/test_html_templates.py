@@ -20,7 +20,7 @@ from tests.log.builders import add_clock_readings, rewrite_log
 from tests.presentation.varied_runs import make_fault_log
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.file_overview import summarise_run
-from trilat_net.log.findings import Finding
+from trilat_net.log.findings import CheckReport, Finding
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
 from trilat_net.presentation import html_templates, page_summary
@@ -79,12 +79,13 @@ def render_everything(log: Log, text: str) -> str:
     """Returns the report of a log, and the HTML in a notebook."""
     certificate = Certificate.of_log(log)
     findings = [Finding(text, text, False), Finding("executed again", text, True)]
+    checks = CheckReport(findings)
     page = render_report(
         log,
         None,
-        findings,
+        checks,
         summarise_run(log),
-        verdict=render_verdict(log, certificate, findings),
+        verdict=render_verdict(log, certificate, checks),
         reasons=render_certificate(log, certificate),
     )
     results = [log, certificate, log[log.sites[0]]]

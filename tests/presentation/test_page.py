@@ -21,7 +21,7 @@ from tests.log.builders import add_clock_readings, rewrite_log
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.file_overview import summarise_run
-from trilat_net.log.findings import Finding
+from trilat_net.log.findings import CheckReport, Finding
 from trilat_net.presentation import plot_signals
 from trilat_net.presentation.figures.registry import (
     FIGURES,
@@ -62,7 +62,7 @@ def read_page(html):
 
 
 def render_page(log, twin=None):
-    return read_page(render_report(log, twin, VERDICTS, summarise_run(log, twin)))
+    return read_page(render_report(log, twin, CheckReport(VERDICTS), summarise_run(log, twin)))
 
 
 def read_column(table, n):
@@ -73,7 +73,11 @@ def test_a_report_has_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
     log = make_run("free", {**JITTER, "rate_hz": 100}).log
     paths = write_report(
-        log, tmp_path / "new", twin=log, certificate=Certificate.of_log(log), verdicts=VERDICTS
+        log,
+        tmp_path / "new",
+        twin=log,
+        certificate=Certificate.of_log(log),
+        wait_for_checks=lambda: CheckReport(VERDICTS),
     )
     assert [path.name for path in paths] == ["report.html", "summary.json"]
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())
@@ -200,7 +204,11 @@ def test_nearly_empty_logs_have_reports(sites, tmp_path):
     )
     twin = make_log_without_hands("paper")
     paths = write_report(
-        log, tmp_path, certificate=Certificate.of_log(log), twin=twin, verdicts=VERDICTS
+        log,
+        tmp_path,
+        certificate=Certificate.of_log(log),
+        twin=twin,
+        wait_for_checks=lambda: CheckReport(VERDICTS),
     )
     assert [path.name for path in paths] == ["report.html", "summary.json"]
     pictures = write_report_figures(log, tmp_path, twin)

@@ -25,12 +25,11 @@ from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, JointError
 from trilat_net.analysis.stability_decision import LoopRoots
-from trilat_net.log.findings import Finding
+from trilat_net.log.findings import CheckReport, Finding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.conclusion import _tabulate_sites, conclude
 from trilat_net.presentation.page_summary import (
-    find_error_peak,
     render_checks,
     render_key_numbers,
     render_verdict,
@@ -61,7 +60,7 @@ def make_certificate(
 
 
 def verdict_text(certificate: Certificate, findings: Sequence[Finding] = ()) -> str:
-    return render_verdict(make_paper_log(), certificate, findings)
+    return render_verdict(make_paper_log(), certificate, CheckReport(list(findings)))
 
 
 def test_stable_run_names_its_proof() -> None:
@@ -88,7 +87,9 @@ def test_lasting_errors_are_explained() -> None:
 def test_pushing_hands_are_named() -> None:
     log = make_short_log("paper")
     pushed = rewrite_log(log, change=lambda row: replace_fields(row, tau_x=[1.0, 0.0]))
-    html = render_verdict(pushed, make_certificate(EndBehaviour.CONVERGED, 0.4), ())
+    html = render_verdict(
+        pushed, make_certificate(EndBehaviour.CONVERGED, 0.4), CheckReport([])
+    )
     assert "not that errors vanish: hands or walls still push m1, m2 and s." in html
 
 
@@ -123,12 +124,12 @@ def test_failed_check_puts_judgement_in_doubt() -> None:
 
 def test_checks_that_passed_are_one_line() -> None:
     facts = {"missing": 0}
-    html = render_checks([PASSED, EXACT, Finding("integrity")], facts)
+    html = render_checks(CheckReport([PASSED, EXACT, Finding("integrity")]), facts)
     summary = "✓ All records present; executed again bit for bit; 1 other check passed."
     assert f"<details><summary>{summary}</summary>" in html
     assert "8/8 in the file" in html
-    assert "3 records missing" in render_checks([PASSED], {"missing": 3})
-    assert render_checks([], facts) == ""
+    assert "3 records missing" in render_checks(CheckReport([PASSED]), {"missing": 3})
+    assert render_checks(CheckReport([]), facts) == ""
 
 
 @pytest.mark.parametrize(
@@ -142,7 +143,7 @@ def test_checks_that_passed_are_one_line() -> None:
     ],
 )
 def test_a_failed_check_is_named(finding: Finding, phrase: str) -> None:
-    assert phrase in render_checks([PASSED, finding], {"missing": 0})
+    assert phrase in render_checks(CheckReport([PASSED, finding]), {"missing": 0})
 
 
 def test_key_numbers_have_place_and_time() -> None:
@@ -151,7 +152,7 @@ def test_key_numbers_have_place_and_time() -> None:
     html = render_key_numbers(log, facts)
     names = {"s from its reference": ["s"], "m1 and m2 from the others": ["m1", "m2"]}
     for name, sites in names.items():
-        peak = find_error_peak(log, sites)
+        peak = JointError.find_largest_of_all(log, sites)
         assert peak is not None
         assert peak.value == max(facts["sites"][site]["max_error_rad"] for site in sites)
         joint = int(peak.joint.removeprefix(f"{peak.site} joint ")) - 1
@@ -202,7 +203,9 @@ def test_limits_stand_under_the_judgement() -> None:
     assert remark not in certify_run(log, twins=0).remarks
     certificate = certify_run(at_limit, twins=0)
     assert certificate.remarks == (remark,)
-    assert f'<p class="remarks">{remark}.</p>' in render_verdict(at_limit, certificate, ())
+    assert f'<p class="remarks">{remark}.</p>' in render_verdict(
+        at_limit, certificate, CheckReport([])
+    )
     for brief in (True, False):
         texts = [block.lines()[0] for block in compose(certificate, brief=brief)]
         line_index = texts.index(f"note {remark}")

@@ -12,6 +12,7 @@ from tests.net.waiting import until
 from tests.page.whole_pages import WatchedPage, watched_page
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.file_overview import summarise_run
+from trilat_net.log.findings import CheckReport
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.page import render_report, write_report
 from trilat_net.scenario.delay_models import DELAY_MODELS
@@ -43,7 +44,9 @@ SCREEN: dict[str, Any] = {
 def open_report(watched: WatchedPage, log: Log, folder: Path) -> Page:
     """Opens the report of a log."""
     path = folder / "report.html"
-    path.write_text(render_report(log, None, [], summarise_run(log, None)), encoding="utf-8")
+    path.write_text(
+        render_report(log, None, CheckReport([]), summarise_run(log, None)), encoding="utf-8"
+    )
     watched.page.goto(path.as_uri())
     return watched.page
 

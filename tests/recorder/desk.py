@@ -22,11 +22,11 @@ from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
-from trilat_net.net.membership import Epoch, EventPublisher, read_messages
+from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, Info
 from trilat_net.net.requests import Backfill, BackfillRequest
 from trilat_net.net.timing import LoopStats
-from trilat_net.net.wire import decode, encode, encode_state
+from trilat_net.net.wire import decode, encode, encode_state, read_messages
 from trilat_net.scenario import Scenario, load_scenario
 
 SESSION = "t"

@@ -36,6 +36,7 @@ from trilat_net.core.step.ticks import LifeReason, Mode, TickInput
 from trilat_net.errors import ScenarioError, SessionError
 from trilat_net.execution.verification import verify_log
 from trilat_net.execution.virtual_comparison import compare_with_virtual
+from trilat_net.log.findings import CheckReport
 from trilat_net.log.log_reader import Log
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient, SwitchClient
@@ -297,7 +298,7 @@ def test_skipped_ticks_count_as_missing_nowhere(tmp_path: Path) -> None:
         return msgspec.structs.replace(state, late_us=1000 if state.tick in (7, 9) else 1)
 
     late = rewrite_log(log, change=delay)
-    page = render_report(late, None, [], summarise_run(late))
+    page = render_report(late, None, CheckReport([]), summarise_run(late))
     assert "; 4 ticks began a period or more late and were executed nevertheless; " in page
     assert f"{skipped} ticks were skipped." in page
 

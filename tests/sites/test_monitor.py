@@ -15,6 +15,7 @@ from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.net import topics
 from trilat_net.net.messages import Event
+from trilat_net.net.session_members import SessionMembers
 from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import encode
 from trilat_net.presentation.terminal_output import TextConsole
@@ -33,7 +34,7 @@ def test_strangers_messages_are_shown_or_ignored(terminal: bool) -> None:
     mine = network.join()
     out = io.StringIO()
     display = SessionDisplay(TextConsole(file=out, force_terminal=terminal, width=200), clock)
-    watch = SessionMonitor(mine, "t", SCENARIO, display)
+    watch = SessionMonitor(SessionMembers(mine, clock, "t"), SCENARIO, display)
     stranger = network.join()
 
     def say(member: str, channel: str, payload: bytes) -> None:

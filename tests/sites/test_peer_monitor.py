@@ -8,9 +8,9 @@ from sites.peer_monitor import PeerMonitor
 from tests.net.local_bus import LocalBus, LocalNetwork
 from tests.net.parties import answer_info
 from trilat_net.net import topics
-from trilat_net.net.membership import EventPublisher, liveliness_token, read_messages
+from trilat_net.net.membership import EventPublisher
 from trilat_net.net.messages import Event
-from trilat_net.net.wire import encode
+from trilat_net.net.wire import encode, read_messages
 
 BOOTS = {"m1": 1, "m2": 2, "s": 3, topics.RECORDER: 9}
 
@@ -28,7 +28,7 @@ class Desk:
 
     def comes(self, member: str, boot: int) -> LocalBus:
         bus = self.network.join()
-        bus.announce(liveliness_token("t", member, boot))
+        bus.announce(topics.presence_token("t", member, boot))
         return bus
 
     def says(self, member: str, boot: int, kind: str, about: str = "", ticks: int = 0) -> None:

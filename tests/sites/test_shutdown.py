@@ -7,7 +7,6 @@ import pytest
 from tests.net.waiting import sleep_for_ns
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.membership import liveliness_token
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
@@ -72,7 +71,7 @@ def test_interrupted_sites_wait_for_all_recorders(tmp_path: Path) -> None:
     session = Session.whole(scenario, tmp_path, ends={})
 
     def come_late(bus: Bus, clock: RelayClock) -> None:
-        bus.announce(liveliness_token(SESSION, topics.RECORDER, 78))
+        bus.announce(topics.presence_token(SESSION, topics.RECORDER, 78))
         sleep_for_ns(clock, S)
         for interrupt in session.interrupts.values():
             interrupt.number = 2

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy as sp
-from trilat_studies.sweep.stability_map import StabilityCriterion
+from trilat_studies.sweep.stability_criteria import StabilityCriterion
 
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import compute_rod_inertia, count_growing, position_network

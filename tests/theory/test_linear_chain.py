@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
-from trilat_studies.sweep.stability_map import StabilityCriterion
+from trilat_studies.sweep.stability_criteria import StabilityCriterion
 
 from tests.core.chain_references import ARMS
 from tests.scenario.builders import two_arm_text

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from trilat_studies.measure_run import WholeRun
+from trilat_studies.record_batches import WholeRun
 from trilat_studies.sweep.sweep_cell import CellClass, classify_cell
 
 from tests.core.chain_references import Array, ChainState, chain_references

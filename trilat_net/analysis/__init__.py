@@ -34,8 +34,8 @@ __all__ = [
     "premise_quantities",
     "verdict_facts",
     # Twins
-    "MOST_LOG",
     "EnvelopeTrend",
+    "SMALLEST",
     "PushGrowth",
     "PushedTwins",
     "TwinGrowth",
@@ -102,7 +102,8 @@ if TYPE_CHECKING:
     from .timeline import Timeline
     from .torque_sources import SourceRows, TorqueSplit, VirtualWall
     from .twins.envelope_trend import EnvelopeTrend
-    from .twins.twin_growth import MOST_LOG, PushedTwins, PushGrowth, TwinGrowth
+    from .twins.twin_growth import PushedTwins, PushGrowth, TwinGrowth
+    from .twins.twin_runs import SMALLEST
 else:
     __getattr__ = import_on_use(
         __name__,
@@ -137,6 +138,7 @@ else:
             "timeline": "Timeline",
             "torque_sources": "SourceRows TorqueSplit VirtualWall",
             "twins.envelope_trend": "EnvelopeTrend",
-            "twins.twin_growth": "MOST_LOG PushGrowth PushedTwins TwinGrowth",
+            "twins.twin_growth": "PushGrowth PushedTwins TwinGrowth",
+            "twins.twin_runs": "SMALLEST",
         },
     )

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import LogError, count_nouns
-from ..files import reading
 from ..log import (
     SESSION,
     Log,
@@ -33,7 +32,6 @@ from ..log import (
     Progress,
     SiteLog,
     open_log,
-    shift_progress,
 )
 from ..records import NS_PER_S
 from ..results import JsonObject, Result, finite_or_none
@@ -102,15 +100,8 @@ class _FileInventory:
             lambda: _Messages(array("Q"), array("Q"), array("Q"))
         )
 
-        files = [path for path in paths if path.is_file()]
-        total_bytes = sum(path.stat().st_size for path in files)
-        bytes_before = 0
-        for path in paths:
-            file_progress = shift_progress(progress, bytes_before, total_bytes)
-            with reading(path) as stream:
-                reader = McapReader(stream, str(path), file_progress)
-                self._read_file(path, reader)
-            bytes_before += path.stat().st_size
+        for path, reader in zip(paths, McapReader.of_files(paths, progress), strict=True):
+            self._read_file(path, reader)
 
     def _read_file(self, path: Path, reader: McapReader) -> None:
         """Adds a file to the inventory: its channels, the numbers of its messages, its damage.

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import msgspec
 
-from ..execution import FusedRun, SimulatedLog, simulate_columns
+from ..execution import FusedRun, SimulatedLog
 from ..log import MIN_COVERAGE, Log
 from ..scenario import Scenario
 from .blas_threads import limit_blas_threads
@@ -182,7 +182,7 @@ class VirtualRun:
         if ObservedEnergy.find_laws(scenario, own_laws=True):
             log: Log = SimulatedLog(scenario)
         else:
-            log = simulate_columns(scenario)
+            log = FusedRun.simulate_log(scenario)
         certificate = replace(
             Certificate.of_log(log, own_laws=True),
             roots=self.roots,

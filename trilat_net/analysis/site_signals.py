@@ -120,6 +120,22 @@ class JointError(NamedTuple):
         return JointError.find_largest(site_log, from_s=float(site_log.t_s[-1]) - END_WINDOW_S)
 
     @classmethod
+    def find_largest_of_all(cls, log: Log, sites: Sequence[str] = ()) -> "JointError | None":
+        """Finds the largest tracking error of several arms in a run.
+
+        Args:
+            log: Log of the run.
+            sites: Names of the sites to consider. Empty for all sites.
+
+        Returns:
+            The earliest occurrence of the largest error. `None` if no record has a finite
+            error.
+        """
+        errors = [JointError.find_largest(log[site]) for site in sites or log.sites]
+        known = [error for error in errors if error is not None]
+        return max(known, key=lambda error: error.value, default=None)
+
+    @classmethod
     def find_last_of_all(cls, log: Log) -> "JointError | None":
         """Finds the largest tracking error of all arms in the last second of their records.
 

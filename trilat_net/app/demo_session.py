@@ -47,7 +47,7 @@ from trilat_net.signals import Interrupt
 from ..core import compiling_notice, is_core_cached
 from ..files import refuse_link
 from ..log import Log, open_log
-from ..net import Clock, Connection, DefaultEndpoints, SystemClock
+from ..net import Clock, Connection, DefaultEndpoints, SessionMembers, SystemClock
 from ..records import NS_PER_S
 from .machine_load import check_machine_load
 from .monitor import SessionDisplay, SessionMonitor
@@ -363,7 +363,8 @@ def run_demo(
             attending = attend(session, endpoints, display.say)
         try:
             with closing(Connection(connect=endpoints).open()) as bus, attending as should_end:
-                monitor = SessionMonitor(bus, session, scenario, display)
+                members = SessionMembers(bus, clock, session)
+                monitor = SessionMonitor(members, scenario, display)
                 while not interrupt.is_requested() and not should_end():
                     if _is_over([*sites, *recorder], result):
                         break

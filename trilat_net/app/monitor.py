@@ -16,12 +16,11 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from trilat_net.net import topics
 from trilat_net.scenario import Scenario
 
 from ..core import HandInForce, LifeAlarm
 from ..log import compute_task_errors
-from ..net import Bus, Clock, Event, LinkStats, State, read_messages
+from ..net import Clock, Event, LinkStats, SessionMembers, State
 from ..records import NS_PER_S
 
 AGES = "age of each peer's sample"
@@ -311,8 +310,7 @@ class SessionMonitor:
     A program that watches a session creates one monitor and calls `poll` repeatedly.
 
     Args:
-        bus: Network connection that reaches the session.
-        session: Name of the session.
+        members: Members of the session, whose messages are shown.
         scenario: Scenario of the session.
         display: Display that shows the state of each site as a table row.
 
@@ -323,8 +321,7 @@ class SessionMonitor:
 
     def __init__(
         self,
-        bus: Bus,
-        session: str,
+        members: SessionMembers,
         scenario: Scenario,
         display: SessionDisplay,
     ) -> None:
@@ -332,12 +329,15 @@ class SessionMonitor:
         self.records: dict[str, State] = {}
         self._scenario = scenario
         self._display = display
-        self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
-        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        # Only the newest record of a site is shown, so an inbox for a single message suffices.
-        self._states = {}
+        self._read_statistics = members.subscribe(LinkStats, capacity=256)
+        self._read_events = members.subscribe(Event, capacity=256)
+        # Only the newest record of a site is shown, so a capacity of one message suffices.
+        self._record_readers = {}
         for name in scenario.names:
-            self._states[name] = bus.inbox(topics.key(session, name, topics.STATE), 1)
+            layout = scenario.layout(name)
+            self._record_readers[name] = members.subscribe(
+                State, name, capacity=1, layout=layout
+            )
 
     def poll(self) -> None:
         """Processes the messages that have arrived, and refreshes the display when due.
@@ -345,14 +345,14 @@ class SessionMonitor:
         Important events are printed above the table. This method never blocks.
         """
         scenario = self._scenario
-        for stats in read_messages(self._links, LinkStats):
-            if stats.site in self._states:
+        for stats in self._read_statistics():
+            if stats.site in self._record_readers:
                 self.latest[stats.site] = stats
-        for event in read_messages(self._events, Event):
+        for event in self._read_events():
             if event.kind in LOUD_EVENTS:
                 self._display.say(event.text)
-        for name, states in self._states.items():
-            for record in read_messages(states, State, scenario.layout(name)):
+        for name, read_records in self._record_readers.items():
+            for record in read_records():
                 self.records[name] = record
 
         if self._display.due:

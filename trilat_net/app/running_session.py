@@ -24,7 +24,6 @@ from typing import Any
 
 from trilat_net.entry_points import HOOKS, load_entry
 from trilat_net.errors import RunFailed, SessionError, UsageError
-from trilat_net.net import topics
 from trilat_net.scenario import Scenario, parse_embedded
 
 from ..net import (
@@ -42,8 +41,6 @@ from ..net import (
     SessionMembers,
     State,
     SystemClock,
-    connect_to_session,
-    read_messages,
 )
 from .input_device import Device
 from .session_ping import PingReport, ping_session
@@ -144,8 +141,7 @@ class RunningSession:
 
         if member:
             self._connection.require(member)
-        with connect_to_session(
-            self._connection,
+        with self._connection.open_session(
             self._clock,
             self.name,
             self._read_site_names,
@@ -501,18 +497,18 @@ class RunningSession:
             A function that returns the records that have arrived since its last call.
         """
         with self.reach("") as bus:
-            addressed = sites or ("*",)  # all sites
-            inboxes = []
-            for site in addressed:
-                key = topics.key(self.name, site, topics.STATE)
-                inboxes.append(bus.inbox(key, STATES_KEPT))
+            members = SessionMembers(bus, self._clock, self.name)
+            readers = [
+                members.subscribe(State, site, capacity=STATES_KEPT)
+                for site in sites or ("*",)  # all sites
+            ]
 
             def receive() -> list[State]:
                 """Returns the records of the subscribed sites that arrived since the last call.
 
                 The list is empty if no record has arrived.
                 """
-                return [record for inbox in inboxes for record in read_messages(inbox, State)]
+                return [record for read_new in readers for record in read_new()]
 
             yield receive
 
@@ -601,13 +597,13 @@ class RunningSession:
         """
         with self.reach("") as bus:
             info = SessionSearch(bus, self._clock, self.name).find_running(site)
-            records = bus.inbox(topics.key(self.name, site, topics.STATE), 256)
-            events = bus.inbox(topics.key(self.name, site, topics.EVENT), 256)
+            members = SessionMembers(bus, self._clock, self.name)
+            read_records = members.subscribe(State, site, capacity=256)
+            read_events = members.subscribe(Event, site, capacity=256)
             scenario = parse_embedded(info.scenario, self.name)
             now_ns = 0  # time of the newest record, since the start of the session
             history = ShareHistory(scenario, site)
             # The weights may have been changed before this subscription.
-            members = SessionMembers(bus, self._clock, self.name)
             for event in members.list_past_events(site):
                 history.add_change(event.command)
 
@@ -617,9 +613,9 @@ class RunningSession:
                 The current time is that of the latest record received from the site.
                 """
                 nonlocal now_ns
-                for event in read_messages(events, Event):
+                for event in read_events():
                     history.add_change(event.command)
-                for record in read_messages(records, State):
+                for record in read_records():
                     now_ns = max(now_ns, record.t_ns)
                 shares = history.advance_to(now_ns)
                 return dict(zip(scenario.peers(site), shares, strict=True))

@@ -16,7 +16,6 @@ from itertools import pairwise
 from typing import Any
 
 from trilat_net.errors import RunFailed, ScenarioError, SessionError
-from trilat_net.net import topics
 from trilat_net.results import Result
 from trilat_net.scenario import parse_embedded
 
@@ -30,8 +29,6 @@ from ..net import (
     LinkStats,
     Pinger,
     SessionMembers,
-    connect_to_session,
-    read_messages,
 )
 
 POLL_NS = 1_000_000
@@ -111,7 +108,7 @@ class SessionPing:
         self._session = session
         self._trips_per_member = count
         self._members = SessionMembers(bus, clock, session)
-        self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
+        self._read_statistics = self._members.subscribe(LinkStats, capacity=256)
         self.pinger = Pinger(bus, clock, session, count)
         self._first_ns: int | None = None
 
@@ -124,7 +121,7 @@ class SessionPing:
             self.infos[info.member] = info
             if self._first_ns is None:
                 self._first_ns = self._clock.monotonic_ns()
-        for stats in read_messages(self._stats, LinkStats):
+        for stats in self._read_statistics():
             self.links[stats.site] = stats
         self.pinger.poll(self._boots)
 
@@ -268,8 +265,8 @@ def ping_session(
             return ()
 
     try:
-        with connect_to_session(
-            connection, clock, session, read_site_names, stopped=stopped, timeout_s=timeout_s
+        with connection.open_session(
+            clock, session, read_site_names, stopped=stopped, timeout_s=timeout_s
         ) as bus:
             if bus is None:
                 return None

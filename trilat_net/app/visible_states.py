@@ -6,10 +6,9 @@ picture with a delay of its own (`[sites.NAME.view]`).
 
 from collections import deque
 
-from trilat_net.net import topics
 from trilat_net.scenario import parse_embedded
 
-from ..net import Bus, Clock, State, read_messages
+from ..net import Bus, Clock, SessionMembers, State
 from ..scenario import PictureDelay
 from .session_search import SessionSearch
 
@@ -35,7 +34,8 @@ class VisibleStates:
         self._search = SessionSearch(bus, clock, session)
         self._session = session
         self._as_site = as_site
-        self._inbox = bus.inbox(topics.key(session, "*", topics.STATE), STATES_KEPT)
+        members = SessionMembers(bus, clock, session)
+        self._read_records = members.subscribe(State, capacity=STATES_KEPT)
         self._records: dict[str, deque[State]] = {}
         self._picture_delay: PictureDelay | None = None  # created when the first record arrives
 
@@ -46,7 +46,7 @@ class VisibleStates:
         a site sees may be older than the latest ones.
         """
         as_site = self._as_site
-        for record in read_messages(self._inbox, State):
+        for record in self._read_records():
             if record.site not in self._records:
                 self._records[record.site] = deque(maxlen=STATES_KEPT)
             self._records[record.site].append(record)

@@ -13,33 +13,21 @@ __all__ = [
     # Runs in virtual time
     "FusedRun",
     "SimulatedLog",
-    "check_virtual",
     "execute_virtual",
     "find_absent_samples",
     "record_virtual",
-    "simulate_columns",
     # Execution of a log
     "LogCheckReport",
     "Rerun",
     "rerun",
     "verify_log",
-    # Twins
-    "LEAST_PUSH",
-    "MOST_PUSH",
-    "PUSH_RAD",
-    "SMALLEST",
-    "Push",
-    "TwinPath",
-    "Twins",
 ]
 
 if TYPE_CHECKING:
     from .fused import FusedRun
     from .log_checks import LogCheckReport
-    from .twins import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
-    from .unwritten_run import simulate_columns
     from .verification import verify_log
-    from .virtual import SimulatedLog, check_virtual, execute_virtual, record_virtual
+    from .virtual import SimulatedLog, execute_virtual, record_virtual
     from .virtual_comparison import find_absent_samples
     from .what_if import Rerun, rerun
 else:
@@ -48,10 +36,8 @@ else:
         {
             "fused": "FusedRun",
             "log_checks": "LogCheckReport",
-            "twins": "LEAST_PUSH MOST_PUSH PUSH_RAD Push SMALLEST TwinPath Twins",
-            "unwritten_run": "simulate_columns",
             "verification": "verify_log",
-            "virtual": "SimulatedLog check_virtual execute_virtual record_virtual",
+            "virtual": "SimulatedLog execute_virtual record_virtual",
             "virtual_comparison": "find_absent_samples",
             "what_if": "Rerun rerun",
         },

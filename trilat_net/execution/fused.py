@@ -3,7 +3,8 @@
 All arms of the experiment are simulated in one compiled loop. Instead of storing every tick,
 the loop stores maxima over intervals of 50 ms, and sums over the run. Parameter sweeps use this
 module. It is also used to repeat runs with a small disturbance, which shows whether they are
-stable.
+stable. Studies that need the records of some runs get them from `FusedRun.simulate_log`, as a
+log that is never encoded.
 
 Invariant:
     - The results are bit-identical to those of `execution.virtual` with its default network.
@@ -16,18 +17,33 @@ Invariant:
 
 import math
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 
-from ..core import MAX_ARRIVALS, CompiledRun, CoreChange, IntArray, LinkSchedule, RunInputs
+from ..core import (
+    MAX_ARRIVALS,
+    Array,
+    CompiledRun,
+    CoreChange,
+    IntArray,
+    LinkSchedule,
+    RunInputs,
+)
 from ..errors import ScenarioError, count_nouns
-from ..log import Log
+from ..log import Log, UnwrittenLog
 from ..records import NS_PER_S
 from ..scenario import (
     HandPlayer,
     PlantPlayer,
     Scenario,
 )
+from .virtual import SimulatedLog
+
+_BLOCK_TICKS = 4096
+"""Interval at which the records of `FusedRun.simulate_log` are copied, in ticks of the fastest
+site.
+"""
 
 
 def _find_largest_ratio(scenario: Scenario) -> int:
@@ -122,6 +138,48 @@ class FusedRun(CompiledRun):
                 path="rate_hz",
                 source=scenario.name,
             )
+
+    @classmethod
+    def simulate_log(cls, scenario: Scenario) -> Log:
+        """Simulates an experiment, and returns a log with the columns of its records.
+
+        The log contains the columns computed by the simulation: times, modes, motions, torques,
+        estimates, sent values, and the samples in use. They are bit-identical to those of
+        `SimulatedLog`, which executes each tick in Python and writes a message for it. A
+        `SimulatedLog` is returned if these columns do not describe the run completely (see
+        `_is_described_by_columns`), or if the run ends early.
+
+        Args:
+            scenario: The scenario.
+
+        Raises:
+            ScenarioError: The scenario cannot run in virtual time.
+            LawFailed: A user's control law failed.
+        """
+        if not _is_described_by_columns(scenario):
+            return SimulatedLog(scenario)
+        run = cls(scenario, keep=_BLOCK_TICKS + 1)
+        blocks: dict[str, list[Array]] = {name: [] for name in scenario.names}
+        for batch in run.iterate_batches():
+            for name, (_, rows) in zip(scenario.names, batch, strict=True):
+                blocks[name].append(rows)
+        if run.diverged_s is not None:
+            return SimulatedLog(scenario)
+
+        columns = {}
+        for i, name in enumerate(scenario.names):
+            rows = np.concatenate(blocks[name])
+            used = run.read_samples_in_use(i, len(rows))
+            ticks = np.arange(len(rows), dtype=np.int64)
+            site_columns: dict[str, Any] = {
+                "mode": np.full(len(rows), "run", dtype=object),
+                "t_ns": ticks * NS_PER_S // scenario.sites[name].rate_hz,
+                "used": dict(zip(scenario.peers(name), used.T, strict=True)),
+            }
+            for field, place in scenario.layout(name).columns().items():
+                site_columns[field] = rows[:, place]
+            columns[name] = site_columns
+        return UnwrittenLog(scenario, columns)
 
     @staticmethod
     def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
@@ -240,3 +298,22 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
             ages_ns = deliveries_ns - stamps_ns
             late_ns = max(late_ns, int(ages_ns.max(initial=0)))
     return first, np.concatenate([*samples, np.zeros(0, np.int64)]), late_ns
+
+
+def _is_described_by_columns(scenario: Scenario) -> bool:
+    """Returns True if the arrays computed by the simulation describe a run completely.
+
+    Some information exists only in a written log: changes of settings, the actions of live
+    operators, the motion of objects in an environment, and the modes of a site that reacts to
+    missing samples.
+
+    Args:
+        scenario: The scenario.
+    """
+    if scenario.timeline or any(link.outages_s for link in scenario.links.values()):
+        return False
+    for name, site in scenario.sites.items():
+        lengths = scenario.layout(name).lengths()
+        if lengths.get("hand") or lengths.get("bodies") or site.on_stale.action != "use":
+            return False
+    return True

@@ -45,14 +45,13 @@ class LogCheckReport(CheckReport):
     been compared, and every re-execution agrees with the log.
 
     Attributes:
+        findings: One finding per check, in display order.
         log: The checked log.
         result: Result of re-executing the sites of the log.
-        findings: One finding per check, in display order.
     """
 
     log: Log
     result: VerifyResult
-    findings: list[Finding]
 
     @property
     def records(self) -> int:
@@ -127,12 +126,12 @@ class LogCheckReport(CheckReport):
         findings = list(_check_log(log, result, virtual=virtual, progress=progress))
         if not resume_every:
             findings = [_add_memory_advice(finding, log, result) for finding in findings]
-        return LogCheckReport(log, result, findings)
+        return LogCheckReport(findings, log, result)
 
     @classmethod
     def check_files(
         cls, sources: Sequence[str], min_coverage: float, allowed: CodeConsents
-    ) -> list[Finding]:
+    ) -> CheckReport:
         """Checks one log in a form that can run in a worker process of a pool.
 
         The arguments and the result can be sent to another process, so many logs can be checked
@@ -146,14 +145,15 @@ class LogCheckReport(CheckReport):
                 process.
 
         Returns:
-            One finding per check.
+            The findings of all checks, without the log.
         """
         allowed_code.update(allowed)
         log = open_log(*sources)
         try:
-            return cls.of_log(log, virtual=True, min_coverage=min_coverage).findings
+            report = cls.of_log(log, virtual=True, min_coverage=min_coverage)
         except ScenarioError as error:
-            return [Finding("executed again", f"cannot be: {error}", False)]
+            return CheckReport([Finding("executed again", f"cannot be: {error}", False)])
+        return CheckReport(report.findings)
 
 
 def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:

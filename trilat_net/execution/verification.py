@@ -42,10 +42,8 @@ from ..log import (
     MIN_COVERAGE,
     Coverage,
     Integrity,
-    LazyRecords,
     Log,
     Progress,
-    RecordsByTick,
     SiteLog,
     count_skipped_ticks,
     open_log,
@@ -423,10 +421,11 @@ class _SiteVerifier:
         has_user_law = self._site.parts.has_user_law
         if samples is not None and indexed is not None and not has_user_law:
             self._plain_rows = PlainRows(self._log, indexed, samples, resume_every)
-        self._states = _list_states(self._log, lazy=self._plain_rows is not None)
+        is_plain = self._plain_rows is not None
+        self._states = self._log.lazy_states if is_plain else self._log.states
         self._inputs = RecordedInputs(
             site_log=log[site],
-            samples=_map_records(log, lazy=self._plain_rows is not None),
+            samples=_map_records(log, lazy=is_plain),
             ends=log.last_ticks,
             changes=log.changes(site),
             links=setup.links,
@@ -924,18 +923,6 @@ def _execute_sites(
         verifier.run(report)
 
 
-def _list_states(site_log: SiteLog, *, lazy: bool) -> Sequence[State]:
-    """Returns the records of a site, decoded now or on first access.
-
-    Args:
-        site_log: Records of the site.
-        lazy: True if only a few of them will be accessed.
-    """
-    if lazy:
-        return LazyRecords(site_log.payloads, site_log.decode, heavy=True)
-    return site_log.states
-
-
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
     """Returns the records of all sites of a log, keyed by site and tick.
 
@@ -946,10 +933,8 @@ def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
         lazy: True if only a few records will be accessed. They are then decoded on access
             instead of all at once.
     """
-    if not lazy:
-        return {name: log[name].by_tick for name in log.sites}
     return {
-        name: RecordsByTick(_list_states(site_log, lazy=True), site_log.tick)
+        name: site_log.lazy_by_tick if lazy else site_log.by_tick
         for name, site_log in log.items()
     }
 

@@ -343,30 +343,6 @@ The function receives the site and the number of the site's next tick.
 """
 
 
-def check_virtual(scenario: Scenario) -> None:
-    """Raises ScenarioError if a scenario cannot run in virtual time.
-
-    In virtual time, all sites run in a single process. A real robot cannot take part, but an
-    arm whose motion is computed by a user's program can.
-
-    Args:
-        scenario: The scenario.
-
-    Raises:
-        ScenarioError: An arm is a real robot, a user's control law cannot be created, or the
-            file of the law has a different hash than stated in the scenario.
-    """
-    # Arms that this program does not simulate are real robots, or belong to users' programs.
-    real_robots = set(scenario.outside)
-    simulated_by_user = set(scenario.external) - real_robots
-    scenario.refuse_external_arms(simulated_by_user)
-    for name, settings in scenario.sites.items():
-        if isinstance(settings.control, ImportedLaw):
-            # A site creates its control law, and raises an error if this is not possible. The
-            # site itself is not needed.
-            Site(scenario.setup(name))
-
-
 def _find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
     """Finds the ticks that a site skipped because its control loop was too late.
 
@@ -572,7 +548,7 @@ def write_virtual_log(
         ScenarioError: The scenario cannot run in virtual time. Nothing has been written.
         LawFailed: A user's control law failed. The log contains an event with the reason.
     """
-    check_virtual(scenario)
+    SimulatedLog.check_scenario(scenario)
     hand_players = HandPlayer.make_all(scenario)
     plants = PlantPlayer.make_all(scenario)
     tracks: dict[str, Callable[[Site, int], Sequence[float]]] = {
@@ -700,6 +676,31 @@ class SimulatedLog(Log):
         super().__init__(LogContents.read(stream, "log", trusted=True))
         self._simulated_scenario = scenario
         self._hands = hands
+
+    @staticmethod
+    def check_scenario(scenario: Scenario) -> None:
+        """Raises ScenarioError if a scenario cannot run in virtual time.
+
+        In virtual time, all sites run in a single process. A real robot cannot take part, but
+        an arm whose motion is computed by a user's program can.
+
+        Args:
+            scenario: The scenario.
+
+        Raises:
+            ScenarioError: An arm is a real robot, a user's control law cannot be created, or
+                the file of the law has a different hash than stated in the scenario.
+        """
+        # Arms that this program does not simulate are real robots, or belong to users'
+        # programs.
+        real_robots = set(scenario.outside)
+        simulated_by_user = set(scenario.external) - real_robots
+        scenario.refuse_external_arms(simulated_by_user)
+        for name, settings in scenario.sites.items():
+            if isinstance(settings.control, ImportedLaw):
+                # A site creates its control law, and raises an error if this is not possible.
+                # The site itself is not needed.
+                Site(scenario.setup(name))
 
     @classmethod
     def without_operators(cls, log: Log) -> "SimulatedLog":

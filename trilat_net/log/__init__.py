@@ -13,23 +13,19 @@ from ..hooks import import_on_use, register_hooks
 
 __all__ = [
     # Reading a log
-    "UNIT_SUFFIXES",
     "Column",
     "IndexedRecords",
     "Ints",
-    "LazyRecords",
     "Log",
     "LogFile",
     "McapReader",
     "Progress",
-    "RecordsByTick",
     "SiteLog",
     "UnwrittenLog",
     "Table",
     "compute_task_errors",
     "open_log",
     "LogContents",
-    "shift_progress",
     # Writing a log
     "FULL_RATE_HZ",
     "VIZ_HZ",
@@ -46,7 +42,6 @@ __all__ = [
     "compute_virtual_boot",
     # Names in a log
     "ACTIVE_SUFFIX",
-    "ALL_CHANNELS",
     "CHANNEL_TYPES",
     "EXECUTED_SITES_KEY",
     "MAX_TIME_NS",
@@ -69,14 +64,13 @@ __all__ = [
     "RecoverySurvey",
     "StartGap",
     "check_file",
-    "count_skipped_ticks",
     "create_signing_keys",
     "describe_unknown_ends",
+    "count_skipped_ticks",
     "recover",
     "sign_log",
     # Orientations
     "MATRIX_ENTRIES",
-    "QUATERNION_AXES",
     "QuaternionSigns",
     "RotationVectors",
     "expand_poses",
@@ -92,12 +86,12 @@ if TYPE_CHECKING:
         count_skipped_ticks,
         describe_unknown_ends,
     )
-    from .data_tables import UNIT_SUFFIXES, Column, Table
+    from .data_tables import Column, Table
     from .findings import CheckReport, Finding
+    from .log_contents import LogContents
     from .log_file import LogFile
     from .log_layout import (
         ACTIVE_SUFFIX,
-        ALL_CHANNELS,
         CHANNEL_TYPES,
         EXECUTED_SITES_KEY,
         MAX_TIME_NS,
@@ -118,16 +112,10 @@ if TYPE_CHECKING:
         PutMessage,
         ReceiveMessage,
     )
-    from .mcap_reader import LogContents, McapReader, Progress, shift_progress
+    from .mcap_reader import McapReader, Progress
     from .mcap_writer import McapWriter, Sink
     from .message_identity import compute_virtual_boot
-    from .orientations import (
-        MATRIX_ENTRIES,
-        QUATERNION_AXES,
-        QuaternionSigns,
-        RotationVectors,
-        expand_poses,
-    )
+    from .orientations import MATRIX_ENTRIES, QuaternionSigns, RotationVectors, expand_poses
     from .packed.indexed_records import IndexedRecords
     from .provenance import collect_provenance
     from .record_columns import Ints
@@ -136,7 +124,7 @@ if TYPE_CHECKING:
     from .running_digest import Integrity
     from .session_check import LogCheckResult, check_file
     from .session_scenario import SessionScenario
-    from .site_log import LazyRecords, RecordsByTick, SiteLog, compute_task_errors
+    from .site_log import SiteLog, compute_task_errors
     from .unwritten_log import UnwrittenLog
     from .view_rates import FULL_RATE_HZ, VIZ_HZ
 else:
@@ -147,22 +135,21 @@ else:
                 "Account Coverage LAST MIN_COVERAGE StartGap count_skipped_ticks "
                 "describe_unknown_ends"
             ),
-            "data_tables": "Column Table UNIT_SUFFIXES",
+            "data_tables": "Column Table",
             "findings": "CheckReport Finding",
+            "log_contents": "LogContents",
             "log_file": "LogFile",
             "log_layout": (
-                "ACTIVE_SUFFIX ALL_CHANNELS CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY "
-                "MAX_TIME_NS RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT"
+                "ACTIVE_SUFFIX CHANNEL_TYPES ChannelFilter EXECUTED_SITES_KEY MAX_TIME_NS "
+                "RERUN_DRIVER SCENARIO SESSION SITE_CHANNELS VIZ_ROOT"
             ),
             "log_reader": "Log open_log",
             "log_signature": "create_signing_keys sign_log",
             "log_writer": "LogParts LogStorage LogWriter MakeViews PutMessage ReceiveMessage",
-            "mcap_reader": "LogContents McapReader Progress shift_progress",
+            "mcap_reader": "McapReader Progress",
             "mcap_writer": "McapWriter Sink",
             "message_identity": "compute_virtual_boot",
-            "orientations": (
-                "MATRIX_ENTRIES QUATERNION_AXES QuaternionSigns RotationVectors expand_poses"
-            ),
+            "orientations": "MATRIX_ENTRIES QuaternionSigns RotationVectors expand_poses",
             "packed.indexed_records": "IndexedRecords",
             "provenance": "collect_provenance",
             "record_columns": "Ints",
@@ -171,7 +158,7 @@ else:
             "running_digest": "Integrity",
             "session_check": "LogCheckResult check_file",
             "session_scenario": "SessionScenario",
-            "site_log": "LazyRecords RecordsByTick SiteLog compute_task_errors",
+            "site_log": "SiteLog compute_task_errors",
             "unwritten_log": "UnwrittenLog",
             "view_rates": "FULL_RATE_HZ VIZ_HZ",
         },

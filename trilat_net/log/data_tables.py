@@ -103,6 +103,12 @@ class Column(NamedTuple):
     known: NDArray[np.bool_] | None = None
 
     @property
+    def stem(self) -> str:
+        """Name of the column without its unit, such as "q1" for "q1_rad"."""
+        suffix = UNIT_SUFFIXES.get(self.unit, "")
+        return self.name.removesuffix(f"_{suffix}") if suffix else self.name
+
+    @property
     def is_text(self) -> bool:
         """True if the column holds strings, False if it holds numbers."""
         return self.values.dtype == np.object_

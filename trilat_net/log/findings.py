@@ -127,8 +127,9 @@ class Findings(dict[str, Finding]):
         return finding
 
 
+@dataclass(frozen=True, repr=False)
 class CheckReport(Result):
-    """Base class for the results of commands that run several checks on a log.
+    """Results of several checks on a log, and the base class for results of such commands.
 
     Derives from the individual findings whether the log passed, and the exit code of the
     command.
@@ -145,6 +146,13 @@ class CheckReport(Result):
         return all(finding.passed for finding in self.findings)
 
     @property
+    def failed(self) -> list[str]:
+        """Names of the checks that were carried out and did not pass."""
+        return [
+            finding.check for finding in self.findings if finding.judged and not finding.passed
+        ]
+
+    @property
     def exit_code(self) -> int:
         """Exit code of a command that reports these checks.
 
@@ -153,7 +161,7 @@ class CheckReport(Result):
           because it would have run third-party code that the user has not permitted.
         - 0 if every check passed.
         """
-        if any(finding.judged and not finding.passed for finding in self.findings):
+        if self.failed:
             return 1
         return 0 if self.passed else CodeWithheld.exit_code
 

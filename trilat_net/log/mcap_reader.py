@@ -1,4 +1,4 @@
-"""Reads MCAP files chunk by chunk, and collects the messages of a log by topic.
+"""Reads MCAP files chunk by chunk.
 
 An MCAP file stores messages in compressed chunks. Each message belongs to a channel, which has
 a topic (a name). `McapReader` reads any MCAP file. `LogContents.read` uses it to load a
@@ -7,34 +7,30 @@ complete log of trilat-net.
 Invariant:
     - The reader holds one uncompressed chunk in memory at a time. Unreadable parts are skipped
       and reported.
-    - The messages of a log stay encoded until they are needed.
     - `McapReader.blocks` yields the same messages as `McapReader.messages`, in the same order
       within each channel, and finds the same damage.
-    - Channels written for viewers (/viz) are skipped.
     - Memory is bounded, even if a file was crafted to cause harm. A channel whose messages
       would need too much memory is read only in part, and the other channels are read
       completely.
 """
 
 import math
-from array import array
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from ..errors import LogError, ScenarioError, count_nouns
-from ..net import topics
-from ..scenario import parse_embedded
+from ..errors import LogError, count_nouns
+from ..files import reading
 from . import mcap_records
-from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 from .packed import chunk_walk
-from .packed.packed_messages import PADDING, Ints, PackedMessages
+from .packed.packed_messages import Ints
 from .running_digest import DIGESTS, Integrity, RunningDigest
 
 _READ = {
@@ -136,7 +132,7 @@ class McapMessage(NamedTuple):
     sequence: int
 
 
-class _MessageBlock(NamedTuple):
+class MessageBlock(NamedTuple):
     """Several messages of one topic that have not yet been copied out of a chunk.
 
     A chunk is a block of messages of all topics that is compressed as a unit. Messages are
@@ -199,7 +195,7 @@ class _MessageBlock(NamedTuple):
         return ends, times
 
 
-def _make_single_block(message: McapMessage) -> _MessageBlock:
+def _make_single_block(message: McapMessage) -> MessageBlock:
     """Returns a block of one message."""
     length = len(message.payload)
     run = chunk_walk.MessageRun.allocate(1)
@@ -209,7 +205,7 @@ def _make_single_block(message: McapMessage) -> _MessageBlock:
     run.counts[0] = 1
     run.lengths[0] = length
     chunk = np.frombuffer(message.payload, np.uint8)
-    return _MessageBlock(message.topic, chunk, run, listed=1, slot=0)
+    return MessageBlock(message.topic, chunk, run, listed=1, slot=0)
 
 
 _BLOCK_BYTES = 1 << 12
@@ -290,6 +286,31 @@ class McapReader:
         # True if the whole file is scanned, however damaged it is.
         self._is_scanned = False
 
+    @classmethod
+    def of_files(
+        cls, paths: Sequence[Path], progress: Progress | None = None
+    ) -> Iterator["McapReader"]:
+        """Opens MCAP files one after another. A file is closed before the next one is opened.
+
+        Args:
+            paths: The files.
+            progress: Function that is called with the number of bytes read so far and the total
+                number of bytes of all files.
+
+        Yields:
+            The reader of each file, from which no message has been read yet.
+
+        Raises:
+            LogError: A file cannot be read, or is not an MCAP file.
+        """
+        total_bytes = sum(path.stat().st_size for path in paths if path.is_file())
+        bytes_before = 0
+        for path in paths:
+            file_progress = shift_progress(progress, bytes_before, total_bytes)
+            with reading(path) as stream:
+                yield cls(stream, str(path), file_progress)
+            bytes_before += path.stat().st_size
+
     @property
     def damaged(self) -> list[mcap_records.Damage]:
         """Unreadable parts of the file found so far.
@@ -328,7 +349,7 @@ class McapReader:
             except mcap_records.UnreadableRecord as error:
                 self._note_damage(item.frame, error)
 
-    def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[_MessageBlock]:
+    def blocks(self, topic_is_kept: Callable[[str], bool]) -> Iterator[MessageBlock]:
         """Yields the messages of selected topics in large blocks.
 
         Finds the same messages as `messages`, but is faster than yielding them one by one.
@@ -600,7 +621,7 @@ class McapReader:
 
     def _read_blocks(
         self, record: mcap_records.ScannedRecord, is_kept: Callable[[str], bool]
-    ) -> Iterator[_MessageBlock]:
+    ) -> Iterator[MessageBlock]:
         """Yields the messages of a record in blocks, and stores its schemas and channels.
 
         Compiled code (`walk_messages`) finds the messages up to the next definition of a schema
@@ -698,7 +719,7 @@ class McapReader:
         count: int,
         run: chunk_walk.MessageRun,
         is_kept: Callable[[str], bool],
-    ) -> Iterator[_MessageBlock]:
+    ) -> Iterator[MessageBlock]:
         """Yields the messages found in a chunk as one block per channel.
 
         The blocks are in the order in which the first message of each channel appears.
@@ -714,7 +735,7 @@ class McapReader:
         for slot in used_slots[by_first_message].tolist():
             topic = self._topics[self._slots[slot]]
             if is_kept(topic):
-                yield _MessageBlock(topic, chunk, run, count, slot)
+                yield MessageBlock(topic, chunk, run, count, slot)
 
     def judge_digest(self) -> Integrity:
         """Determines from the digests in the file whether the file was modified later.
@@ -857,241 +878,3 @@ class _PartlyReadRecord:
     digested: int = 0
     messages: int = 0
     memory: int = 0
-
-
-_LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
-"""Latest time stamp that fits into a signed 64-bit integer, in ns."""
-
-
-_FIRST_BYTES = 1 << 12
-"""Initial space for the messages of a topic, in bytes."""
-
-
-class ChannelMessages:
-    """All messages of one topic in a log, still encoded, in file order.
-
-    Attributes:
-        log_ns: Arrival time of each of the K messages at the recorder in Unix time, in ns.
-        publish_ns: Sending time stated by each message in Unix time, in ns.
-    """
-
-    def __init__(self) -> None:
-        self._data = np.zeros(_FIRST_BYTES, np.uint8)
-        self._size = 0
-        self._ends = array("q")
-        self.log_ns = array("Q")
-        self.publish_ns = array("Q")
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    @property
-    def payloads(self) -> PackedMessages:
-        """The payloads of all K messages of the topic, as published.
-
-        Messages that are added to the topic later are not included.
-        """
-        data = self._reserve(PADDING)
-        ends = np.array(self._ends, np.int64)
-        starts = np.concatenate([np.zeros(1, np.int64), ends])[: len(ends)]
-        return PackedMessages(data[: self._size + PADDING], starts, ends)
-
-    def payload(self, number: int) -> bytes:
-        """Returns the payload of one message of the topic, as published.
-
-        Args:
-            number: Number of the message, counted from 0.
-        """
-        start = self._ends[number - 1] if number else 0
-        return self._data[start : self._ends[number]].tobytes()
-
-    def _reserve(self, size: int) -> NDArray[np.uint8]:
-        """Returns the array with the payloads of all messages, with space for more at its end.
-
-        The array at least doubles whenever it grows, which keeps many small additions cheap.
-
-        Args:
-            size: Number of additional bytes.
-        """
-        needed = self._size + size
-        if needed > len(self._data):
-            larger_array = np.empty(max(needed, 2 * len(self._data)), np.uint8)
-            larger_array[: self._size] = self._data[: self._size]
-            self._data = larger_array
-        return self._data
-
-    def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Appends a message to those of the topic.
-
-        Messages must be added in file order.
-
-        Args:
-            payload: The message, encoded as published.
-            log_ns: Arrival time at the recorder in Unix time, in ns.
-            publish_ns: Sending time in Unix time, in ns.
-        """
-        data = self._reserve(len(payload))
-        end = self._size + len(payload)
-        data[self._size : end] = np.frombuffer(payload, np.uint8)
-        self._size = end
-        self._ends.append(end)
-        self.log_ns.append(log_ns)
-        self.publish_ns.append(publish_ns)
-
-    def add_block(self, block: _MessageBlock) -> None:
-        """Appends a block of messages to those of the topic. Blocks must come in file order."""
-        data = self._reserve(block.most_bytes)
-        ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
-        self._size = int(ends[-1])
-        # The bytes of the NumPy arrays are appended to compact arrays of integers.
-        self._ends.frombytes(ends.tobytes())
-        self.log_ns.frombytes(log_ns.tobytes())
-        self.publish_ns.frombytes(publish_ns.tobytes())
-
-    def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the arrival and sending times of the topic's K messages as arrays, in ns.
-
-        Returns:
-            The arrival times and the sending times in Unix time, each of shape (K,). A time of
-            2^63 ns or later is replaced by the largest value that fits.
-        """
-        return _clip_times(self.log_ns), _clip_times(self.publish_ns)
-
-
-def _clip_times(times: "array[int]") -> NDArray[np.int64]:
-    """Converts unsigned times to signed times, clipping those that are too late."""
-    unsigned = np.array(times, dtype=np.uint64)
-    return np.minimum(unsigned, _LAST_SIGNED_NS).astype(np.int64)
-
-
-@dataclass
-class LogContents:
-    """Everything in a log, from one or several files, before its messages are decoded.
-
-    Attributes:
-        sources: Names of the files.
-        session: Metadata of the session, such as its name and its start time.
-        scenario: Encoded text of the scenario.
-        metadata: Maps the name of each metadata record to its contents.
-        channels: Maps each topic to its messages.
-        complete: True if all parts are present and finished, and can be read completely.
-        ended: True if the last part was finished.
-        damaged: One sentence for each part of a file that cannot be read.
-        chain: Whether the log matches its digests. For several files, the worst result.
-    """
-
-    sources: tuple[str, ...]
-    session: dict[str, str]
-    scenario: bytes
-    metadata: dict[str, dict[str, str]]
-    channels: dict[str, ChannelMessages] = field(repr=False)
-    complete: bool
-    ended: bool
-    damaged: list[str]
-    chain: Integrity
-
-    @property
-    def source(self) -> str:
-        """Name of the log for error messages, so that users know which file is meant."""
-        more = len(self.sources) - 1
-        if not more:
-            return self.sources[0]
-        return f"{self.sources[0]} and {more} more {'parts' if more > 1 else 'part'}"
-
-    @classmethod
-    def read(
-        cls,
-        stream: BinaryIO,
-        name: str,
-        progress: Progress | None = None,
-        *,
-        trusted: bool = False,
-    ) -> "LogContents":
-        """Reads everything in a log file into memory, without decoding the messages.
-
-        Args:
-            stream: The file, opened for reading.
-            name: Name of the file for error messages.
-            progress: Function that is called after every record of the file.
-            trusted: True if this program has just written the file. Memory for the messages is
-                then unlimited. The limit protects against files crafted to cause harm, but a
-                harmless file in which arms hardly move may exceed it, because it compresses so
-                well.
-
-        Raises:
-            LogError: The file is not an MCAP file, or not a log of trilat-net.
-        """
-        reader = McapReader(stream, name, progress, kept=not trusted)
-        channels: dict[str, ChannelMessages] = {}
-        for block in reader.blocks(_is_log_topic):
-            channel = channels.setdefault(block.topic, ChannelMessages())
-            channel.add_block(block)
-        _check_head(reader, name)
-
-        damaged = [f"{name}: {damage}" for damage in reader.damaged]
-        is_first_part = reader.metadata.get(PART, {}).get("index", "1") == "1"
-        return cls(
-            sources=(name,),
-            session=reader.metadata[SESSION],
-            scenario=reader.attachments[SCENARIO],
-            metadata=reader.metadata,
-            channels=channels,
-            complete=reader.complete and not damaged and is_first_part,
-            ended=reader.complete,
-            damaged=damaged,
-            chain=reader.judge_digest(),
-        )
-
-    @staticmethod
-    def check(stream: BinaryIO, name: str) -> None:
-        """Reads a log once, without storing its messages, to find out whether it can be opened.
-
-        A log of any length can be checked with little memory.
-
-        Args:
-            stream: The file, opened for reading.
-            name: Name of the file for error messages.
-
-        Raises:
-            LogError: The file cannot be opened as a log. The message states the reason.
-        """
-        reader = McapReader(stream, name)
-        # Reads all messages, but stores no message.
-        deque(reader.blocks(_is_log_topic), maxlen=0)
-        _check_head(reader, name)
-        try:
-            parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")
-        except (ScenarioError, UnicodeDecodeError) as error:
-            raise LogError(
-                f"{name}: the scenario in this log cannot be read: {error}"
-            ) from None
-
-
-def _is_log_topic(topic: str) -> bool:
-    """True if the messages of a topic belong to a log of this program."""
-    key = topics.parse_key(topic.removeprefix("/"))
-    return key is not None and key.channel in CHANNEL_TYPES
-
-
-def _check_head(reader: McapReader, name: str) -> None:
-    """Raises LogError unless an MCAP file is a log of trilat-net, which describes a session.
-
-    Args:
-        reader: Reader that has read the complete file.
-        name: Name of the file for the error message.
-
-    Raises:
-        LogError: The file lacks the metadata of the session, or the scenario.
-    """
-    session = reader.metadata.get(SESSION, {})
-    missing_parts = [key for key in ("session", "driver") if key not in session]
-    if SCENARIO not in reader.attachments:
-        missing_parts.append(SCENARIO)
-    if missing_parts:
-        # The missing part may have been in a damaged part of the file.
-        reason = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
-        problem = (
-            f"{name}: is an MCAP file, but not a log of trilat-net: {missing_parts[0]} is "
-            "missing"
-        )
-        raise LogError(f"{problem}; {reason}" if reason else problem)

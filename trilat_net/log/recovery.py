@@ -34,6 +34,7 @@ from ..scenario import parse_embedded
 from . import mcap_records
 from .accounting import Account, Coverage
 from .content_check import ContentCheck
+from .log_contents import LogContents
 from .log_file import LogFile
 from .log_layout import (
     ACCOUNTS,
@@ -44,7 +45,7 @@ from .log_layout import (
     SESSION,
     describe_unfinished,
 )
-from .mcap_reader import LogContents, McapReader, Progress
+from .mcap_reader import McapReader, Progress
 from .mcap_records import Damage, ScannedRecord, UnreadableRecord
 from .mcap_writer import McapWriter
 from .provenance import collect_provenance

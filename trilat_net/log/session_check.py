@@ -67,14 +67,13 @@ class LogCheckResult(CheckReport):
     Printed by `trilat log check`.
 
     Attributes:
-        files: Names of the files.
         findings: The result of each check, with the problems that it found.
+        files: Names of the files.
         ours: True if the files are a log of trilat-net. Otherwise they are other MCAP files,
             and only their bytes were checked.
     """
 
     files: list[str]
-    findings: list[Finding]
     ours: bool
 
     def to_dict(self) -> dict[str, Any]:
@@ -155,7 +154,9 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
         hint = describe_unfinished(Path(name))
         raise LogError(f"{name} cannot be read: {error.strerror}{hint}") from None
     return LogCheckResult(
-        [path.as_posix() for path in paths], list(check.findings()), check.ours
+        findings=list(check.findings()),
+        files=[path.as_posix() for path in paths],
+        ours=check.ours,
     )
 
 

@@ -135,6 +135,38 @@ class LazyRecords(Sequence[State]):
 
         self._get_block = get_block
 
+    @classmethod
+    def decode_short(
+        cls, payloads: Sequence[bytes], decode_block: DecodeStates
+    ) -> Sequence[State]:
+        """Decodes the records of a site at once if they need little memory.
+
+        A list is faster to use, but keeps all decoded records in memory. Records are therefore
+        decoded immediately only if there are at most `MAX_DECODED_RECORDS` of them, and if they
+        are not heavy (see `HEAVY_BYTES`).
+
+        Args:
+            payloads: The encoded records.
+            decode_block: Function that decodes a block of them.
+
+        Returns:
+            The records in the order of `payloads`: a list, or a sequence that decodes on
+            access.
+        """
+        if len(payloads) > MAX_DECODED_RECORDS:
+            return cls(payloads, decode_block)
+
+        remaining_bytes = max(HEAVY_BYTES, _HEAVY_RATIO * sum(map(len, payloads)))
+        states: list[State] = []
+        with process.pause_gc():
+            for first in range(0, len(payloads), BLOCK_RECORDS):
+                block = decode_block(payloads[first : first + BLOCK_RECORDS])
+                remaining_bytes -= sum(map(_estimate_bytes, block))
+                if remaining_bytes < 0:
+                    return cls(payloads, decode_block, heavy=True)
+                states += block
+        return states
+
     def __len__(self) -> int:
         return len(self._payloads)
 
@@ -157,35 +189,6 @@ class LazyRecords(Sequence[State]):
             )
         block = self._get_block(row // self._size)
         return block[row % self._size]
-
-
-def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
-    """Decodes the records of a site, either immediately or when they are accessed.
-
-    A list is faster to use, but keeps all decoded records in memory. Records are therefore
-    decoded immediately only if there are at most `MAX_DECODED_RECORDS` of them, and if they are
-    not heavy (see `HEAVY_BYTES`).
-
-    Args:
-        payloads: The encoded records.
-        decode_block: Function that decodes a block of them.
-
-    Returns:
-        The records in the order of `payloads`: a list, or a sequence that decodes on access.
-    """
-    if len(payloads) > MAX_DECODED_RECORDS:
-        return LazyRecords(payloads, decode_block)
-
-    remaining_bytes = max(HEAVY_BYTES, _HEAVY_RATIO * sum(map(len, payloads)))
-    states: list[State] = []
-    with process.pause_gc():
-        for first in range(0, len(payloads), BLOCK_RECORDS):
-            block = decode_block(payloads[first : first + BLOCK_RECORDS])
-            remaining_bytes -= sum(map(_estimate_bytes, block))
-            if remaining_bytes < 0:
-                return LazyRecords(payloads, decode_block, heavy=True)
-            states += block
-    return states
 
 
 def _estimate_bytes(state: State) -> int:
@@ -505,7 +508,12 @@ class SiteLog:
         If there are many records, a record is decoded only when it is accessed. For
         computations on a single quantity, arrays such as `q` are much faster.
         """
-        return decode_records(self.payloads, self.decode)
+        return LazyRecords.decode_short(self.payloads, self.decode)
+
+    @cached_property
+    def lazy_states(self) -> Sequence[State]:
+        """The records of `states`, decoded on access, for callers that need only a few."""
+        return LazyRecords(self.payloads, self.decode, heavy=True)
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
@@ -517,6 +525,11 @@ class SiteLog:
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
+
+    @cached_property
+    def lazy_by_tick(self) -> Mapping[int, State]:
+        """The mapping `by_tick`, whose records are decoded on access."""
+        return RecordsByTick(self.lazy_states, self.tick)
 
     @property
     def last_tick(self) -> int:

@@ -18,8 +18,8 @@ import numpy as np
 from ..core import Array
 from ..errors import LogError
 from ..scenario import Scenario
+from .log_contents import LogContents
 from .log_reader import Log
-from .mcap_reader import LogContents
 from .running_digest import DigestState, Integrity
 from .site_log import SiteLog, freeze
 

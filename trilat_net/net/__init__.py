@@ -4,10 +4,11 @@ Several processes of a session each control one robot arm; others record the mes
 people take part. For example, the process of a slave arm receives the positions of two master
 arms, typically a thousand times per second. The package contains:
 
-- the network connection: `bus`, `zenoh_bus`, `connection`, `member_keys`;
+- the network connection: `bus`, `zenoh_bus`, `connection`, `default_endpoints`,
+  `member_keys`;
 - the messages and their encoding: `messages`, `requests`, `wire`, `topics`;
 - clocks, and the measurement of offsets between them: `clock`, `pinging`, `offset`, `timing`;
-- the synchronised start of all processes: `membership`, `session`, `discovery`;
+- the synchronised start of all processes: `membership`, `session`, `session_members`;
 - access for programs outside the session: `arm_client`, `known_sites`, `ros2`.
 """
 
@@ -68,7 +69,6 @@ __all__ = [
     "ArmMeasurement",
     "Backfill",
     "BackfillRequest",
-    "ChangeQuery",
     "ChangeReply",
     "ChangeRequest",
     "Event",
@@ -97,6 +97,7 @@ __all__ = [
     "make_sample_reader",
     "messages",
     "number_message",
+    "read_messages",
     "skipped_numbers",
     "split_states",
     "topics",
@@ -120,11 +121,9 @@ __all__ = [
     "EventPublisher",
     "LateSites",
     "SessionJoin",
-    "connect_to_session",
     "describe_member",
     "SessionMembers",
     "new_boot",
-    "read_messages",
     # Programs outside a session
     "ArmClient",
     "Hand",
@@ -137,8 +136,8 @@ if TYPE_CHECKING:
     from .arm_client import ArmClient, Hand, HandSender, SiteClient, SwitchClient
     from .bus import Bus, Inbox, Query, QueryInbox, StampedInbox, matches_key
     from .clock import Clock, SystemClock
-    from .connection import ENCRYPTED, ENDS_SOON, Connection, DefaultEndpoints
-    from .discovery import connect_to_session
+    from .connection import ENCRYPTED, ENDS_SOON, Connection
+    from .default_endpoints import DefaultEndpoints
     from .host_names import check_hosts
     from .known_sites import make_site_known, stop_at_once
     from .member_keys import (
@@ -153,14 +152,7 @@ if TYPE_CHECKING:
         read_member_keys,
         renew_keys,
     )
-    from .membership import (
-        Epoch,
-        EventPublisher,
-        LateSites,
-        describe_member,
-        new_boot,
-        read_messages,
-    )
+    from .membership import Epoch, EventPublisher, LateSites, describe_member, new_boot
     from .messages import (
         HALTED_MODES,
         MODE_WORDS,
@@ -199,7 +191,7 @@ if TYPE_CHECKING:
         PeerSeen,
     )
     from .session import SessionJoin
-    from .session_members import REPLY_TIMEOUT_S, ChangeQuery, SessionMembers
+    from .session_members import REPLY_TIMEOUT_S, SessionMembers
     from .site_stand_in import SiteStandIn
     from .timing import LinkTimingMonitor, LoopStats, PeerClock, SiteTiming, find_turn_ns
     from .topics import (
@@ -219,6 +211,7 @@ if TYPE_CHECKING:
         join_states,
         make_decoder,
         make_sample_reader,
+        read_messages,
         split_states,
     )
     from .zenoh_bus import open_zenoh, share_threads
@@ -230,17 +223,15 @@ else:
             "arm_client": "ArmClient Hand HandSender SiteClient SwitchClient",
             "bus": "Bus Inbox Query QueryInbox StampedInbox matches_key",
             "clock": "Clock SystemClock",
-            "connection": "Connection DefaultEndpoints ENCRYPTED ENDS_SOON",
-            "discovery": "connect_to_session",
+            "connection": "Connection ENCRYPTED ENDS_SOON",
+            "default_endpoints": "DefaultEndpoints",
             "host_names": "check_hosts",
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
                 "AUTHORITY CERTIFICATE HERE MEMBERS PRIVATE_KEY add_keys create_keys "
                 "read_foreign_permissions read_member_keys renew_keys"
             ),
-            "membership": (
-                "Epoch EventPublisher LateSites describe_member new_boot read_messages"
-            ),
+            "membership": "Epoch EventPublisher LateSites describe_member new_boot",
             "messages": (
                 "Event HALTED_MODES Info LinkStats MODES MODE_WORDS ModeMeaning PeerSample "
                 "READABLE RESTING_MODES RecorderStats SENT_TIME_SINCE STATE_VECTORS Stamp "
@@ -254,7 +245,7 @@ else:
                 "OrderName PeerSeen"
             ),
             "session": "SessionJoin",
-            "session_members": "ChangeQuery REPLY_TIMEOUT_S SessionMembers",
+            "session_members": "REPLY_TIMEOUT_S SessionMembers",
             "site_stand_in": "SiteStandIn",
             "timing": "LinkTimingMonitor LoopStats PeerClock SiteTiming find_turn_ns",
             "topics": (
@@ -263,7 +254,7 @@ else:
             ),
             "wire": (
                 "MAX_BYTES decode encode encode_sample encode_state join_states "
-                "make_decoder make_sample_reader split_states"
+                "make_decoder make_sample_reader read_messages split_states"
             ),
             "zenoh_bus": "open_zenoh share_threads",
             "zenoh_config": "BRIDGE Endpoint OPERATOR ROLES ROUTER SITE_ROLE",

@@ -37,10 +37,10 @@ from . import topics
 from .bus import Bus
 from .clock import Clock, SystemClock
 from .connection import Connection
-from .membership import new_boot, read_messages
+from .membership import new_boot
 from .messages import Event, State
 from .requests import ArmEnable, ArmMeasurement, DirectMessage, HandMessage
-from .wire import decode, encode, split_states
+from .wire import decode, encode, read_messages, split_states
 from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000

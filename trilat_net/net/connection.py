@@ -1,142 +1,43 @@
 """Decides how a process connects to the network of a session.
 
-Two processes of a session on one machine find each other without any options, because each site
-has a default port derived from the name of the session and the index of the site. If the
+On one machine, the sites of a session listen on default endpoints (`default_endpoints`). If the
 session spans several machines, the user names the endpoints, for example tcp/host:10241. A
 `Connection` holds the endpoints on which a process listens and to which it connects, its mode
 and, optionally, the keys that prove its identity. `Connection.of_member` builds one from the
 command line and the user's Zenoh file.
 
+Programs that are not (yet) part of a session find it with `Connection.open_session`: the
+recorder before it joins, and the commands that stop arms, change network delays or measure the
+network.
+
 Invariant:
-    - Default endpoints are only reachable from this machine (127.0.0.1). Other machines cannot
-      connect unless the user names an endpoint.
-    - Sessions with different names usually get different default ports, because the port is
-      derived from a checksum of the name.
+    - Other machines cannot connect unless the user names an endpoint.
     - An endpoint named by the user replaces the default. If the command line and the file name
       different endpoints, they are either combined or rejected; neither is silently preferred.
 """
 
 import ipaddress
 import re
-import socket
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import SessionError, UsageError
+from ..errors import ScenarioError, SessionError, UsageError
+from . import topics
+from .bus import Bus
 from .clock import Clock
+from .default_endpoints import DefaultEndpoints
 from .host_names import UnknownHost, check_hosts, find_endpoint_addresses
+from .known_sites import find_known_endpoints
+from .session_members import SessionMembers
 from .zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, merge_settings
 
 if TYPE_CHECKING:
     from .member_keys import MemberKeys
-
-_FIRST_PORT = 10_240
-"""Lowest default port. The default ports are divided into blocks, one block per session."""
-_BLOCKS = 340
-"""Number of blocks. The block of a session is selected by the CRC-32 of its name."""
-_BLOCK = 64
-"""Number of ports in a block."""
-
-
-@dataclass(frozen=True, slots=True)
-class DefaultEndpoints:
-    """Network addresses on which the sites of a session listen unless the user names others.
-
-    The ports are computed from the name of the session and the index of the site, so every
-    process can find the endpoints without configuration.
-
-    Attributes:
-        session: Name of the session.
-    """
-
-    session: str
-
-    def of_site(self, index: int) -> str:
-        """Returns the endpoint of one site on this machine, such as "tcp/127.0.0.1:10241".
-
-        Args:
-            index: Index of the site in the scenario, starting from 0.
-        """
-        # A checksum of the name selects one of `_BLOCKS` blocks of consecutive ports, so that
-        # two sessions on one machine rarely get the same ports.
-        block = zlib.crc32(self.session.encode()) % _BLOCKS
-        port = _FIRST_PORT + block * _BLOCK + index % _BLOCK
-        return f"tcp/127.0.0.1:{port}"
-
-    def by_site(self, sites: Sequence[str], *, encrypted: bool = False) -> dict[str, str]:
-        """Returns a mapping from the name of each site to its endpoint.
-
-        Args:
-            sites: Names of the sites, in scenario order.
-            encrypted: True for TLS endpoints instead of TCP.
-        """
-        endpoints = {}
-        for index, site in enumerate(sites):
-            endpoint = self.of_site(index)
-            endpoints[site] = endpoint.replace("tcp/", "tls/") if encrypted else endpoint
-        return endpoints
-
-    @contextmanager
-    def reserve(self, site_count: int) -> Iterator[list[str]]:
-        """Reserves a network endpoint for each site of the session, as a context manager.
-
-        The default endpoints are used if they are free; otherwise any free ports are used.
-        Inside the `with` block, other callers of this method get different endpoints, so two
-        sessions with the same name can run at the same time.
-
-        Args:
-            site_count: Number of sites.
-
-        Yields:
-            One endpoint per site, in scenario order.
-        """
-        default = [self.of_site(index) for index in range(site_count)]
-        ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
-        # The last port of the block shows that the block is reserved. The ports themselves
-        # cannot show it, because they are shared with the sites that will listen on them.
-        first_port_of_block = ports[0] - ports[0] % _BLOCK
-        last_port_of_block = first_port_of_block + _BLOCK - 1
-        with ExitStack() as stack:
-            try:
-                _bind_ports(stack, [last_port_of_block], shared=False)
-                endpoints = _bind_ports(stack, ports, shared=True)
-            except OSError:
-                endpoints = _bind_ports(stack, [0] * site_count, shared=True)
-            yield endpoints
-
-
-def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Reserves ports of this machine for sites that will listen on them.
-
-    A port is reserved by binding a socket to it without listening. The operating system then
-    does not assign the port to programs that ask for any free port.
-
-    Args:
-        stack: Closes the sockets, which ends the reservation.
-        ports: Numbers of the ports. 0 stands for any free port.
-        shared: True if the site can listen on its port while the port is still reserved. False
-            to reserve the port exclusively.
-
-    Returns:
-        The endpoints of the reserved ports, in the same order.
-
-    Raises:
-        OSError: A port is in use.
-    """
-    sockets = [stack.enter_context(socket.socket()) for _ in ports]
-    for reserving_socket, port in zip(sockets, ports, strict=True):
-        reserving_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(shared))
-        reserving_socket.bind(("127.0.0.1", port))
-
-    reserved_ports = [reserving_socket.getsockname()[1] for reserving_socket in sockets]
-    return [f"tcp/127.0.0.1:{port}" for port in reserved_ports]
-
 
 ENDS_SOON = timedelta(days=7)
 """The user is warned if the keys expire within this time."""
@@ -144,6 +45,12 @@ _DATE = "%Y-%m-%d %H:%M:%S UTC"
 """Format of the expiry date in messages to the user."""
 RETRY_NS = 200_000_000
 """Time between two attempts to reach a router, in ns."""
+
+SiteNamesOf = Callable[[str], tuple[str, ...]]
+"""Function that returns the names of the sites from the text of a scenario, in scenario order.
+
+It raises `ScenarioError` if the text is not a scenario.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -476,6 +383,137 @@ class Connection:
                 has_reported = True
             clock.sleep_until(clock.monotonic_ns() + RETRY_NS)
         return None
+
+    @contextmanager
+    def open_session(
+        self,
+        clock: Clock,
+        session: str,
+        names: SiteNamesOf,
+        *,
+        stopped: Callable[[], bool],
+        timeout_s: float | None,
+        say: Callable[[str], None] = lambda _: None,
+        recorder_boot: int | None = None,
+    ) -> Iterator[Bus | None]:
+        """Connects to the sites of a session, as a context manager that closes the connection.
+
+        If the endpoints are not known (`connect` is None), they are found in one of two ways.
+        If files on this machine show that all sites of the session run here, their endpoints
+        are used. Otherwise, the first site of the session is queried at its default endpoint on
+        this machine. It returns the names of the other sites, which determine their default
+        endpoints.
+
+        Args:
+            clock: Clock of the caller.
+            session: Name of the session.
+            names: Function that returns the names of the sites in a scenario. If it returns no
+                names, only the first site is connected.
+            stopped: Function that returns True to cancel the search.
+            timeout_s: Longest wait for the first site or for a router, in s. If None, there is
+                no limit.
+            say: Function that prints a line for the user.
+            recorder_boot: Boot of the caller (the random number that identifies this start of
+                its process) if the caller is a recorder. The recorder is then announced during
+                the search, so that the session waits for it. None for other callers.
+
+        Yields:
+            The network connection, or None if `stopped` returned True.
+
+        Raises:
+            SessionError: No site or router replies in time.
+            UsageError: An endpoint cannot be used.
+        """
+        with ExitStack() as stack:
+
+            def connect(target: Connection) -> Bus | None:
+                """Opens a network connection, which is closed at the end of the `with` block.
+
+                Returns None if `stopped` has returned True.
+                """
+                bus = target.open_bus(clock, stopped, timeout_s, say)
+                return None if bus is None else stack.enter_context(closing(bus))
+
+            connection = self
+            # A recorder does not use the known sites: it must announce itself to the first
+            # site.
+            if connection.connect is None and recorder_boot is None:
+                known_endpoints = find_known_endpoints(session, connection)
+                connection = replace(connection, connect=known_endpoints)
+            if connection.connect is None:
+                default_endpoints = DefaultEndpoints(session)
+                first_endpoint = default_endpoints.of_site(0)
+                first_bus = connect(replace(connection, listen=(), connect=[first_endpoint]))
+                sites = None
+                if first_bus is not None:
+                    if recorder_boot is not None:
+                        token = topics.presence_token(session, topics.RECORDER, recorder_boot)
+                        first_bus.announce(token)
+                    sites = _query_sites(
+                        bus=first_bus,
+                        clock=clock,
+                        session=session,
+                        first_endpoint=first_endpoint,
+                        parse_site_names=names,
+                        stopped=stopped,
+                        timeout_s=timeout_s,
+                    )
+                if sites is None:  # the caller has stopped the search
+                    yield None
+                    return
+                endpoints = list(default_endpoints.by_site(sites).values()) or [first_endpoint]
+                connection = replace(connection, connect=endpoints)
+            yield connect(connection)
+
+
+def _query_sites(
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    first_endpoint: str,
+    parse_site_names: SiteNamesOf,
+    stopped: Callable[[], bool],
+    timeout_s: float | None,
+) -> tuple[str, ...] | None:
+    """Queries the members of a session for the names of its sites.
+
+    A site replies with its scenario, which names all sites of the session.
+
+    Args:
+        bus: Network connection through which the first site can be reached.
+        clock: Clock of the caller.
+        session: Name of the session.
+        first_endpoint: Default endpoint of the first site, for the error message.
+        parse_site_names: Function that returns the names of the sites from the text of a
+            scenario. It raises `ScenarioError` if the text is not a scenario.
+        stopped: Function that returns True to cancel the search.
+        timeout_s: Longest wait for a reply, in s. If None, the wait lasts until `stopped`
+            returns True.
+
+    Returns:
+        The names, from the first reply that contains a scenario, or None if `stopped` returned
+        True.
+
+    Raises:
+        SessionError: No member with a scenario replies in time.
+    """
+    members = SessionMembers(bus, clock, session)
+    for info in members.find(stopped=stopped, timeout_s=timeout_s):
+        try:
+            if info.scenario:
+                return parse_site_names(info.scenario)
+        except ScenarioError:  # not a scenario of this program
+            continue
+
+    # The search has ended, because the caller has stopped it or because the time is over. The
+    # second case cannot occur without a limit, so `timeout_s` is a number below.
+    if stopped():
+        return None
+    raise SessionError(
+        f"no site of session {session!r} answered at {first_endpoint} "
+        f"within {timeout_s:g} s; check the name of the session, or name other endpoints with "
+        "--connect"
+    )
 
 
 def _check_encrypted_endpoint(address: str) -> None:

@@ -31,9 +31,9 @@ from .zenoh_config import Endpoint, ZenohMode, merge_settings
 if TYPE_CHECKING:
     from .connection import Connection
 
-QUERY_PERIOD_NS = 50_000_000
+_QUERY_PERIOD_NS = 50_000_000
 """Time between two queries to the sites that have not replied yet, in ns."""
-POLL_NS = 1_000_000
+_POLL_NS = 1_000_000
 """Time between two polls for replies, in ns."""
 PATIENCE_NS = 1_500_000_000
 """Time after which the command falls back to searching for the session, in ns."""
@@ -345,7 +345,7 @@ def _order_stop(known_sites: Sequence[_KnownSite], sites: Sequence[str], keys: s
             # A query reaches only the members that are connected already. It is repeated for
             # those that connect later.
             if now_ns >= next_query_ns:
-                next_query_ns = now_ns + QUERY_PERIOD_NS
+                next_query_ns = now_ns + _QUERY_PERIOD_NS
                 for site in remaining:
                     key = topics.key(session, site, topics.STOP)
                     queries.append((site, bus.query(key, order), []))
@@ -357,5 +357,5 @@ def _order_stop(known_sites: Sequence[_KnownSite], sites: Sequence[str], keys: s
                     for reply in replies:
                         _print(reply["text"])
                         all_stop = all_stop and reply["accepted"]
-            clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+            clock.sleep_until(clock.monotonic_ns() + _POLL_NS)
     return all_stop and not remaining

@@ -24,21 +24,19 @@ Invariant:
 import hashlib
 import platform
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import msgspec
 
-from ..errors import SessionError, WireError
-from ..records import Layout
+from ..errors import SessionError
 from . import topics
-from .bus import Bus, Inbox
+from .bus import Bus
 from .clock import Clock
-from .messages import Event, Info, State
+from .messages import Event, Info
 from .scenario_difference import describe_scenario_difference
 from .session_members import SessionMembers
-from .wire import M, decode, encode, split_states
+from .wire import encode
 
 
 def new_boot() -> int:
@@ -82,44 +80,6 @@ def describe_member(
         "fingerprint": fingerprint,
     }
     return msgspec.convert({**basic_fields, **fields}, Info)
-
-
-def liveliness_token(session: str, member: str, boot: int) -> str:
-    """Returns the key of the token that shows that a particular start of a member is present.
-
-    Zenoh informs all members of the session when the token appears, and when the process that
-    declared it has disappeared.
-
-    Args:
-        session: Name of the session.
-        member: Name of the member.
-        boot: Random number that identifies the start of the member's process.
-    """
-    return topics.key(session, member, topics.ALIVE) + f"/{boot}"
-
-
-def read_messages(inbox: Inbox, kind: type[M], layout: Layout | None = None) -> Iterator[M]:
-    """Removes all waiting messages from an inbox, and yields those of the given type.
-
-    Payloads that cannot be decoded as this type are skipped without an error, because any
-    program on the network can publish under the key of the inbox. Sites publish their records
-    in blocks; if a record of a block cannot be decoded, the rest of the block is skipped too.
-
-    Args:
-        inbox: Queue of encoded messages.
-        kind: Expected type of the messages.
-        layout: Expected numbers of joints and peers. Messages with other numbers are treated as
-            undecodable. If None, all numbers are accepted.
-
-    Yields:
-        The decoded messages, in order of arrival.
-    """
-    while (message := inbox.poll()) is not None:
-        _key, block = message
-        # Sites and recorders count the payloads that they cannot decode.
-        with suppress(WireError):
-            for payload in split_states(block) if kind is State else [block]:
-                yield decode(payload, kind, layout=layout)
 
 
 class EventPublisher:

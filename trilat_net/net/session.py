@@ -40,11 +40,10 @@ from .membership import (
     EventPublisher,
     LateSites,
     Membership,
-    liveliness_token,
-    read_messages,
 )
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
+from .wire import read_messages
 
 EPOCH_AHEAD_NS = 500_000_000
 """Time from the proposal of an epoch to the epoch, in ns. Two round trips are added."""
@@ -120,7 +119,7 @@ class SessionJoin:
         self._attempt = 0
         self._ready_epochs: dict[str, int] = {}  # the epoch on each ready member's clock
 
-        bus.announce(liveliness_token(session, self._info.member, self._info.boot))
+        bus.announce(topics.presence_token(session, self._info.member, self._info.boot))
 
     @property
     def reason(self) -> str:

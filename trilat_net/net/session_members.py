@@ -1,4 +1,4 @@
-"""Queries the members of a session, and sends requests to its sites.
+"""Queries the members of a session, receives their messages, and sends requests to its sites.
 
 Members use this module to find each other. Programs outside the session, such as the commands
 that stop arms or change network delays, use it to reach the members.
@@ -13,15 +13,18 @@ Invariant:
 import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
+from typing import TypeVar
 
 import msgspec
 from msgspec import UNSET
 
 from ..errors import SessionError, WireError
+from ..records import Layout
 from . import topics
-from .bus import Bus
+from .bus import RING_CAPACITY, Bus, Inbox
 from .clock import Clock
-from .messages import Event, Info
+from .messages import Event, Info, LinkStats, State
 from .pinging import RepeatedQuery
 from .requests import (
     BACKFILL_MESSAGES,
@@ -29,11 +32,10 @@ from .requests import (
     BackfillRequest,
     ChangeReply,
     ChangeRequest,
-    DirectMessage,
 )
-from .wire import decode, encode
+from .wire import decode, encode, read_messages
 
-POLL_NS = 5_000_000
+_POLL_NS = 5_000_000
 """Time between two polls for replies, in ns."""
 REPLY_TIMEOUT_S = 3.0
 """Longest wait for a reply, in s."""
@@ -42,70 +44,24 @@ _NAME_CHECK_S = 0.7
 
 Sites try to connect every half second.
 """
+_CHANNELS: dict[type, str] = {
+    State: topics.STATE,
+    LinkStats: topics.LINK,
+    Event: topics.EVENT,
+}
+"""Channel on which members publish the messages of each type."""
 
-
-class ChangeQuery:
-    """A request for a change that was sent to a site, and whose reply is awaited.
-
-    Args:
-        bus: Network connection through which the site can be reached.
-        clock: Clock of the caller.
-        session: Name of the session.
-        site: Name of the site.
-        request: The requested change, or a command such as "stop".
-    """
-
-    def __init__(
-        self, bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest
-    ) -> None:
-        self._bus = bus
-        self._clock = clock
-        channel = topics.STOP if request.order == "stop" else topics.SET
-        self._key = topics.key(session, site, channel)
-        self._send(request)
-
-    def _send(self, request: ChangeRequest) -> None:
-        """Sends the request, and starts to wait for its reply."""
-        self._request = request
-        self._replies = self._bus.query(self._key, encode(request))
-        self._sent_ns = self._clock.monotonic_ns()
-
-    @property
-    def is_overdue(self) -> bool:
-        """True if the site has not replied within `REPLY_TIMEOUT_S`."""
-        return self._clock.monotonic_ns() - self._sent_ns >= REPLY_TIMEOUT_S * 1e9
-
-    def poll(self) -> ChangeReply | None:
-        """Returns the reply of the site, which accepts or rejects the request.
-
-        Returns:
-            The reply. None while it has not arrived.
-
-        Raises:
-            WireError: The reply cannot be decoded.
-        """
-        arrived = self._replies.poll()
-        if arrived is None:
-            return None
-        _, payload = arrived
-        reply = decode(payload, ChangeReply)
-        request = self._request
-        if request.order == "stop" and not reply.accepted and request.source is not UNSET:
-            # A site with an older version of this program does not know the field `source`, and
-            # refuses the whole request. Its arm must stop as well.
-            self._send(msgspec.structs.replace(request, source=UNSET))
-            return None
-        return reply
+P = TypeVar("P", State, LinkStats, Event)
 
 
 class SessionMembers:
-    """Queries the members of a running session over an open connection.
+    """Receives messages from the members of a session, and sends them queries and requests.
 
     Args:
         bus: Network connection through which the session can be reached.
         clock: Clock of the caller.
         session: Name of the session.
-        member: Name of the member whose identity is queried. "*" queries all members.
+        member: Name of the member that is addressed. "*" stands for all members.
 
     Attributes:
         unreadable: Reasons why replies could not be decoded, keyed by the name of the member
@@ -117,7 +73,38 @@ class SessionMembers:
         self._bus = bus
         self._clock = clock
         self._session = session
-        self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
+        self._member = member
+        self._query = self._make_query()
+
+    def _make_query(self) -> RepeatedQuery:
+        """Returns a new query for the identities of the members."""
+        key = topics.key(self._session, self._member, topics.INFO)
+        return RepeatedQuery(self._bus, self._clock, key)
+
+    def subscribe(
+        self,
+        kind: type[P],
+        member: str = "",
+        *,
+        capacity: int = RING_CAPACITY,
+        layout: Layout | None = None,
+    ) -> Callable[[], Iterator[P]]:
+        """Subscribes to the messages of one type, and returns a function that reads them.
+
+        Args:
+            kind: Type of the messages: records, statistics or events.
+            member: Name of the member that publishes the messages. If empty, the messages of
+                the members that this object addresses are received.
+            capacity: Number of messages that can wait to be read. If more arrive, the oldest
+                ones are dropped.
+            layout: Expected numbers of joints and peers, see `read_messages`.
+
+        Returns:
+            A function that removes and yields the messages that have arrived since the last
+            call. Messages that cannot be decoded are skipped.
+        """
+        key = topics.key(self._session, member or self._member, _CHANNELS[kind])
+        return partial(read_messages, self._bus.inbox(key, capacity), kind, layout)
 
     def poll(self) -> Iterator[Info]:
         """Yields the identities that have arrived, and repeats the query if it is due.
@@ -151,7 +138,7 @@ class SessionMembers:
         """Queries the members of a session, and yields their identities as they arrive.
 
         The query is repeated until the search ends, because a reply may be lost. The same
-        identity is therefore yielded repeatedly.
+        identity is therefore yielded repeatedly. Replies to earlier queries do not count.
 
         Args:
             stopped: Function that returns True to end the search.
@@ -164,6 +151,8 @@ class SessionMembers:
             SessionError: The time has run out, and none of the replies received could be
                 decoded.
         """
+        self._query = self._make_query()
+        self.unreadable.clear()
         has_readable_reply = False
         begun_ns = self._clock.monotonic_ns()
         timeout_ns = math.inf if timeout_s is None else timeout_s * 1e9
@@ -171,16 +160,12 @@ class SessionMembers:
             for info in self.poll():
                 has_readable_reply = True
                 yield info
-            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+            self._clock.sleep_until(self._clock.monotonic_ns() + _POLL_NS)
         if self.unreadable and not has_readable_reply and not stopped():
             member, reason = next(iter(self.unreadable.items()))
             raise SessionError(f"the reply of {member} cannot be read: {reason}")
 
-    def send_change(
-        self,
-        site: str,
-        request: ChangeRequest,
-    ) -> ChangeReply:
+    def send_change(self, site: str, request: ChangeRequest) -> ChangeReply:
         """Sends a request to a site of a running session, and waits for the reply.
 
         If the members of the session have keys, only the operator's keys allow changes. The
@@ -196,21 +181,29 @@ class SessionMembers:
         Raises:
             SessionError: The site does not reply.
         """
-        query = ChangeQuery(self._bus, self._clock, self._session, site, request)
-        while not query.is_overdue:
-            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
-            try:
-                reply = query.poll()
-            except WireError as error:
-                raise SessionError(f"the reply of {site} cannot be read: {error}") from None
-            if reply is not None:
-                return reply
+        poll = self.request_change(site, request)
+        try:
+            while (reply := poll()) is None:
+                self._clock.sleep_until(self._clock.monotonic_ns() + _POLL_NS)
+        except WireError as error:
+            raise SessionError(f"the reply of {site} cannot be read: {error}") from None
+        return reply
 
-        hint = "; in a session with keys, only the operator may request changes"
-        raise SessionError(
-            f"{site} did not answer; the records of {site} show whether the change was made"
-            f"{'' if request.order == 'stop' else hint}"
-        )
+    def request_change(
+        self, site: str, request: ChangeRequest
+    ) -> Callable[[], ChangeReply | None]:
+        """Sends a request to a site like `send_change`, but does not wait for the reply.
+
+        Args:
+            site: Name of the site.
+            request: The requested change, or a command such as "stop".
+
+        Returns:
+            A function that returns the reply of the site, or None if no reply has arrived yet.
+            It raises SessionError if the site has not replied within `REPLY_TIMEOUT_S`, and
+            WireError if the reply cannot be decoded.
+        """
+        return _RequestedChange(self._bus, self._clock, self._session, site, request).poll
 
     def list_past_events(
         self,
@@ -232,7 +225,7 @@ class SessionMembers:
                 request = BackfillRequest(
                     channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
                 )
-                reply = self._query_once(key, request)
+                reply = self._wait_for_reply(self._bus.query(key, encode(request)))
                 backfill = None if reply is None else decode(reply, Backfill)
                 if backfill is None or not backfill.payloads:
                     return
@@ -262,26 +255,74 @@ class SessionMembers:
                 "another name with --prefix or --session"
             )
 
-    def _query_once(
-        self,
-        key: str,
-        request: DirectMessage,
-    ) -> bytes | None:
-        """Sends a request to other processes once, and waits for the first reply.
+    def _wait_for_reply(self, replies: Inbox) -> bytes | None:
+        """Waits for the first reply to a query, and returns its payload.
 
-        Args:
-            key: Key under which the receiver accepts requests, see `topics.key`.
-            request: The request.
-
-        Returns:
-            The payload of the reply, or None if no reply arrives within `REPLY_TIMEOUT_S`.
+        Returns None if no reply arrives within `REPLY_TIMEOUT_S`.
         """
-        replies = self._bus.query(key, encode(request))
         deadline_ns = self._clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
         while self._clock.monotonic_ns() < deadline_ns:
-            self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
+            self._clock.sleep_until(self._clock.monotonic_ns() + _POLL_NS)
             reply = replies.poll()
             if reply is not None:
                 _key, payload = reply
                 return payload
         return None
+
+
+class _RequestedChange:
+    """A request that has been sent to a site, and whose reply is awaited.
+
+    A site with an older version of this program does not know the field `source`, and refuses
+    the whole request. Its arm must stop as well, so a refused command to stop is repeated
+    without this field.
+
+    Args:
+        bus: Network connection through which the site can be reached.
+        clock: Clock of the caller.
+        session: Name of the session.
+        site: Name of the site.
+        request: The requested change, or a command such as "stop".
+    """
+
+    def __init__(
+        self, bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest
+    ) -> None:
+        self._bus = bus
+        self._clock = clock
+        self._site = site
+        self._request = request
+        self._stops = request.order == "stop"
+        channel = topics.STOP if self._stops else topics.SET
+        self._key = topics.key(session, site, channel)
+        self._replies = self._send()
+
+    def _send(self) -> Inbox:
+        """Sends the request, and returns the queue that receives the reply."""
+        self._sent_ns = self._clock.monotonic_ns()
+        return self._bus.query(self._key, encode(self._request))
+
+    def poll(self) -> ChangeReply | None:
+        """Returns the reply of the site, or None if no reply has arrived yet.
+
+        Raises:
+            SessionError: The site has not replied within `REPLY_TIMEOUT_S`.
+            WireError: The reply cannot be decoded.
+        """
+        entry = self._replies.poll()
+        if entry is None:
+            if self._clock.monotonic_ns() - self._sent_ns > REPLY_TIMEOUT_S * 1e9:
+                hint = "; in a session with keys, only the operator may request changes"
+                raise SessionError(
+                    f"{self._site} did not answer; the records of {self._site} show whether "
+                    f"the change was made{'' if self._stops else hint}"
+                )
+            return None
+
+        _key, payload = entry
+        reply = decode(payload, ChangeReply)
+        if self._stops and not reply.accepted and self._request.source is not UNSET:
+            self._request = msgspec.structs.replace(self._request, source=UNSET)
+            self._replies = self._send()
+            return None
+        return reply

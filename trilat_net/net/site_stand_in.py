@@ -15,7 +15,7 @@ import msgspec
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .membership import describe_member, liveliness_token
+from .membership import describe_member
 from .pinging import answer_backfill, answer_pings
 from .requests import BackfillRequest
 from .wire import encode
@@ -61,7 +61,7 @@ class SiteStandIn:
         self._identity_queries = bus.query_inbox(topics.key(session, site, topics.INFO))
         self._backfill_queries = bus.query_inbox(topics.key(session, site, topics.PAST))
         answer_pings(bus, clock, session, self._info)
-        bus.announce(liveliness_token(session, site, boot))
+        bus.announce(topics.presence_token(session, site, boot))
 
     def start_session(
         self, epoch_mono_ns: int, epoch_unix_ns: int, boots: dict[str, int]

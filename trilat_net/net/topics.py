@@ -85,6 +85,20 @@ def presence_key(session: str, member: str) -> str:
     return f"{key(session, member, ALIVE)}/*"
 
 
+def presence_token(session: str, member: str, boot: int) -> str:
+    """Returns the key of the token that shows that a particular start of a member is present.
+
+    Zenoh informs all members of the session when the token appears, and when the process that
+    declared it has disappeared.
+
+    Args:
+        session: Name of the session.
+        member: Name of the member.
+        boot: Random number that identifies the start of the member's process.
+    """
+    return f"{key(session, member, ALIVE)}/{boot}"
+
+
 def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
     """Yields the processes that have appeared or disappeared since the last call.
 

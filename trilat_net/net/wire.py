@@ -17,6 +17,7 @@ Invariant:
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from functools import cache
 from itertools import chain
 from operator import attrgetter
@@ -27,6 +28,7 @@ import msgspec
 
 from ..errors import WireError, count_nouns
 from ..records import MAX_JOINTS, Arrival, Layout, TickRecord
+from .bus import Inbox
 from .messages import (
     MODE_WORDS,
     STATE_VECTORS,
@@ -339,6 +341,30 @@ def decode(
             value that is not finite, or contains a vector of the wrong length.
     """
     return make_decoder(kind, tuple(versions), layout)(payload)  # type: ignore[no-any-return]
+
+
+def read_messages(inbox: Inbox, kind: type[M], layout: Layout | None = None) -> Iterator[M]:
+    """Removes all waiting messages from an inbox, and yields those of the given type.
+
+    Payloads that cannot be decoded as this type are skipped without an error, because any
+    program on the network can publish under the key of the inbox. Sites publish their records
+    in blocks; if a record of a block cannot be decoded, the rest of the block is skipped too.
+
+    Args:
+        inbox: Queue of encoded messages.
+        kind: Expected type of the messages.
+        layout: Expected numbers of joints and peers. Messages with other numbers are treated as
+            undecodable. If None, all numbers are accepted.
+
+    Yields:
+        The decoded messages, in order of arrival.
+    """
+    while (message := inbox.poll()) is not None:
+        _key, block = message
+        # Sites and recorders count the payloads that they cannot decode.
+        with suppress(WireError):
+            for payload in split_states(block) if kind is State else [block]:
+                yield decode(payload, kind, layout=layout)
 
 
 @cache

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..analysis import Timeline
 from ..core import Array
 from ..errors import UnknownName, UsageError, suggest_nearest
-from ..log import UNIT_SUFFIXES, Column, Ints, Log
+from ..log import Column, Ints, Log
 from ..log.ros2 import NUMBERS_BY_MODE_WORD
 from ..scenario import TASK_AXES
 from . import style
@@ -189,7 +189,7 @@ def _list_columns(log: Log, site: str) -> list[Column]:
     errors = log[site].e
     for index, (stem, unit) in enumerate(zip(stems, units, strict=True)):
         column = Column(
-            name=f"{stem}_{UNIT_SUFFIXES[unit]}",
+            name=f"{stem}_{unit}",
             values=errors[:, index],
             unit=unit,
             meaning="error that the control law acts on",
@@ -208,13 +208,7 @@ def _get_quantity(column: Column) -> str:
         if column.source.startswith(start):
             return quantity
     field, bracket, _ = column.source.partition("[")
-    return field if bracket else _get_stem(column)
-
-
-def _get_stem(column: Column) -> str:
-    """Returns the name of a column without its unit, such as "q1" for "q1_rad"."""
-    suffix = UNIT_SUFFIXES.get(column.unit, "")
-    return column.name.removesuffix(f"_{suffix}") if suffix else column.name
+    return field if bracket else column.stem
 
 
 def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) -> _Panels:
@@ -237,7 +231,7 @@ def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) ->
     panels: _Panels = {}
     for site, site_columns in columns.items():
         for column in site_columns:
-            accepted_names = (column.name, _get_stem(column), _get_quantity(column))
+            accepted_names = (column.name, column.stem, _get_quantity(column))
             if name in accepted_names:
                 line = _Line(site, log[site].tick, log[site].t_s, column)
                 panels.setdefault(column.name, []).append(line)
@@ -439,7 +433,7 @@ def _draw_panel(
     first_s, last_s = interval_s
     column = lines[0].column
     unit = f" ({style.typeset_unit(column.unit)})" if column.unit else ""
-    axes.set_title(f"{_get_stem(column)}{unit}")
+    axes.set_title(f"{column.stem}{unit}")
     category_names = _list_words(lines)
 
     # A column of texts, such as the mode, is a step curve between named values.

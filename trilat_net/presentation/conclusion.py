@@ -21,7 +21,7 @@ import numpy as np
 from ..analysis import JointError, certify_run
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
 from ..execution import LogCheckReport, SimulatedLog
-from ..log import MIN_COVERAGE, CheckReport, Finding, Log, Progress, SiteLog
+from ..log import MIN_COVERAGE, CheckReport, Log, Progress, SiteLog
 from ..own_code import allowed_code
 from ..scenario import END_WINDOW_S
 from ..workers import worker_pool
@@ -44,19 +44,18 @@ class Conclusion(CheckReport):
     Created by `conclude` after a run was recorded.
 
     Attributes:
+        findings: Results of the log checks, one per check.
         verdict: The verdict on whether the run was stable.
         meaning: Lines that explain the verdict, with remarks about the run.
         table: Table with one row per arm.
         notes: Lines about the stability proof and about notable facts of the run, such as
             changed settings or messages from a user's control law.
-        findings: Results of the log checks, one per check.
         paths: Log files, and files that were written.
     """
 
     verdict: CertificateLine
     table: TextTable
     notes: list[str]
-    findings: list[Finding]
     paths: list[Path]
     meaning: list[CertificateLine] = field(default_factory=list)
 
@@ -153,7 +152,6 @@ def conclude(
     from .figures.registry import write_report_figures
     from .page import write_report
 
-    findings: list[Finding] = []
     # Two processor cores are used: the log is executed while its figures are drawn.
     with worker_pool(1) as pool:
         allowed = dict(allowed_code)
@@ -173,33 +171,30 @@ def conclude(
                 pushed=certificate.twins,
             )
 
-        def wait_for_findings() -> Iterator[Finding]:
-            """Yields the result of each log check once all checks have finished.
+        def wait_for_checks() -> CheckReport:
+            """Returns the results of the log checks once all checks have finished.
 
             The checks run in another process, which re-executes the log; `check` is the future
-            for their results. This generator blocks only when the first result is requested, so
-            the report can be prepared in the meantime. It also stores the results in the list
-            `findings`, which is empty until then.
+            for their results.
 
             Raises:
                 RunFailed: The other process was terminated.
             """
             try:
-                results = check.result()
-                findings.extend(results)
+                return check.result()
             except BrokenProcessPool:
                 raise RunFailed(
                     "the process that reruns the log ended unexpectedly; try again"
                 ) from None
-            yield from findings
 
         report = write_report(
             log,
             folder,
             twin=twin,
             certificate=certificate,
-            verdicts=wait_for_findings(),
+            wait_for_checks=wait_for_checks,
         )
+        findings = wait_for_checks().findings
     untimed = explain_missing_loop_times(log)
     timing_lines = [untimed] if untimed else []
     verdict = describe_certificate(certificate)[0]

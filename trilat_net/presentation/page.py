@@ -22,7 +22,7 @@ Invariant:
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from markupsafe import Markup
 from ..analysis import Certificate, summarise_run
 from ..errors import count_nouns
 from ..files import make_folder, write_whole
-from ..log import Finding, Log
+from ..log import CheckReport, Log
 from ..results import JsonObject
 from ..scenario import Scenario
 from .appearance import SITE_COLOURS
@@ -62,8 +62,8 @@ def write_report(
     folder: Path,
     *,
     certificate: Certificate,
+    wait_for_checks: Callable[[], CheckReport],
     twin: Log | None = None,
-    verdicts: Iterable[Finding] = (),
 ) -> list[Path]:
     """Writes the report of a run, report.html and summary.json, to a folder.
 
@@ -74,11 +74,11 @@ def write_report(
         log: Log of the run.
         folder: Folder for both files. Created if it does not exist.
         certificate: Stability certificate of the run.
+        wait_for_checks: Function that returns the results of the log checks. It is called only
+            after the figures of the certificate are drawn, because another process may still be
+            checking the log until then.
         twin: Log of the same run, simulated without operators. The page shows the difference,
             which is the motion caused by the operators. If `None`, this section is omitted.
-        verdicts: Results of the log checks. They are read only after the figures of the
-            certificate are drawn, because another process may still be checking the log until
-            then.
 
     Returns:
         The paths of the page and of the summary.
@@ -88,14 +88,14 @@ def write_report(
     facts["certificate"] = certificate.to_dict()
     reasons = render_certificate(log, certificate)
 
-    findings = list(verdicts)
-    facts["checks"] = [finding.to_row() for finding in findings]
+    checks = wait_for_checks()
+    facts["checks"] = checks.to_rows()
     page = render_report(
         log=log,
         twin=twin,
-        verdicts=findings,
+        checks=checks,
         facts=facts,
-        verdict=render_verdict(log, certificate, findings),
+        verdict=render_verdict(log, certificate, checks),
         reasons=reasons,
     )
 
@@ -110,7 +110,7 @@ def write_report(
 def render_report(
     log: Log,
     twin: Log | None,
-    verdicts: Sequence[Finding],
+    checks: CheckReport,
     facts: JsonObject,
     verdict: Markup = Markup(),  # noqa: B008
     reasons: Markup = Markup(),  # noqa: B008
@@ -120,7 +120,7 @@ def render_report(
     Args:
         log: Log of the run.
         twin: Log of the same run without operators, or `None`, see `write_report`.
-        verdicts: Results of the log checks.
+        checks: Results of the log checks.
         facts: Key figures of the run, from `summarise_run`.
         verdict: HTML of the stability verdict, shown at the top of the page. Empty for none.
         reasons: HTML of the section that explains the verdict. Empty to omit the section.
@@ -143,7 +143,7 @@ def render_report(
         changes=describe_changes(scenario),
         verdict=verdict,
         alarms=render_alarms(log),
-        checks=render_checks(verdicts, facts),
+        checks=render_checks(checks, facts),
         numbers=render_key_numbers(log, facts),
         overview=render_overview(log, builder, data.charts),
         motion=_render_motion(chart_groups["motion"]),

@@ -28,7 +28,7 @@ from ..analysis import (
     Timeline,
 )
 from ..errors import count_nouns, join_words
-from ..log import Finding, Log
+from ..log import CheckReport, Log
 from ..results import JsonObject
 from ..scenario import END_WINDOW_S
 from .certificate_text import describe_pace, describe_settling
@@ -78,7 +78,7 @@ The clause about a run that converged contains values, see `_explain_end`.
 """
 
 
-def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
+def render_verdict(log: Log, certificate: Certificate, checks: CheckReport) -> Markup:
     """Renders the verdict on whether a run was stable, with the evidence for it.
 
     The verdict is at the top of the page of a run.
@@ -86,7 +86,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     Args:
         log: Log of the run.
         certificate: Stability certificate of the run.
-        findings: Results of the log checks. If any failed, the verdict is in doubt.
+        checks: Results of the log checks. If any failed, the verdict is in doubt.
     """
     if log.why_empty:
         return render_macro(
@@ -109,8 +109,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
             sentences.append(f"{_start_sentence(decay_rate)}.")
         sentences.append(_ROOTS_AND_THEOREM)
 
-    has_failed_check = any(finding.judged and not finding.passed for finding in findings)
-    if has_failed_check:
+    if checks.failed:
         css_class = "bad" if css_class == "bad" else "warn"
         sentences.append("The log failed a check, so the judgement may be wrong.")
 
@@ -272,23 +271,6 @@ def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
     return render_macro("summary.html", "key_numbers", numbers=numbers)
 
 
-def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
-    """Finds the largest tracking error of any joint in a run, with its joint and time.
-
-    The tracking error is the difference between a joint angle and its reference.
-
-    Args:
-        log: Log of the run.
-        sites: Names of the sites to consider. Empty for all sites.
-
-    Returns:
-        The earliest occurrence of the largest error. `None` if no record has a finite error.
-    """
-    peaks = [JointError.find_largest(log[site]) for site in sites or log.sites]
-    known_peaks = [peak for peak in peaks if peak is not None]
-    return max(known_peaks, key=lambda peak: peak.value, default=None)
-
-
 def _list_error_cards(log: Log) -> list[_KeyNumber]:
     """Returns the key figures about errors, for the slaves and then for the masters.
 
@@ -317,7 +299,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
         place: Phrase for the pose from which the error is measured, appended to the name of the
             number.
     """
-    peak = find_error_peak(log, sites)
+    peak = JointError.find_largest_of_all(log, sites)
     if peak is None:
         return _KeyNumber(f"{join_words(sites)} {place}", NO_NUMBER, "no record")
 
@@ -422,45 +404,42 @@ def render_alarms(log: Log) -> Markup:
     )
 
 
-def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
+def render_checks(checks: CheckReport, facts: JsonObject) -> Markup:
     """Renders the results of the log checks as one line, which expands into a list.
 
     The list is expanded initially if a check has failed.
 
     Args:
-        findings: Results of the checks. Some may be undecided, for example because the code of
-            a user's control law is not allowed to run here.
+        checks: Results of the checks. Some may be undecided, for example because the code of a
+            user's control law is not allowed to run here.
         facts: Key figures of the run, from `summarise_run`.
 
     Returns:
         HTML of the line. Empty if nothing was checked.
     """
-    if not findings:
+    if not checks.findings:
         return Markup()
 
-    failed_checks = [
-        finding.check for finding in findings if finding.judged and not finding.passed
-    ]
-    undecided_checks = [finding.check for finding in findings if not finding.judged]
-    summary = f"✓ {_summarise_checks(findings, facts)}"
-    if failed_checks:
-        summary = f"✗ Failed: {', '.join(failed_checks)}"
+    undecided_checks = [finding.check for finding in checks.findings if not finding.judged]
+    summary = f"✓ {_summarise_checks(checks, facts)}"
+    if checks.failed:
+        summary = f"✗ Failed: {', '.join(checks.failed)}"
     elif undecided_checks:
         summary = f"? Not judged: {', '.join(undecided_checks)}"
 
-    result_list = render_macro("summary.html", "checks", findings=findings)
-    details = render_details(summary, result_list, is_open=bool(failed_checks))
+    result_list = render_macro("summary.html", "checks", findings=checks.findings)
+    details = render_details(summary, result_list, is_open=bool(checks.failed))
     return render_macro("summary.html", "check_line", details=details)
 
 
-def _summarise_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
+def _summarise_checks(checks: CheckReport, facts: JsonObject) -> str:
     """Returns a sentence about the log checks if all of them passed.
 
     For example: "All records present; executed again bit for bit; 3 other checks passed." A
     result with a remark, such as ticks that a site did not execute, is quoted in full.
     """
     clauses = []
-    for finding in findings:
+    for finding in checks.findings:
         has_remark = ";" in finding.text
         if finding.check == "records":
             missing = facts["missing"]
@@ -474,7 +453,7 @@ def _summarise_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
         elif finding.check == "executed again":
             clauses.append(f"executed again: {finding.text}")
 
-    other_count = len(findings) - len(clauses)
+    other_count = len(checks.findings) - len(clauses)
     if other_count:
         clauses.append(f"{count_nouns(other_count, 'other check')} passed")
     text = "; ".join(clauses)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from ..analysis import Bools, Timeline
+from ..analysis import Bools, JointError, Timeline
 from ..core import Array
 from ..errors import count_nouns, join_words
 from ..log import Log
@@ -24,7 +24,6 @@ from ..results import JsonObject
 from ..scenario import Scenario
 from .html_templates import render_macro
 from .page_html import render_details, render_section
-from .page_summary import find_error_peak
 from .plot_signals import shared_unit, sites_with_operator
 from .style import typeset
 
@@ -276,7 +275,7 @@ def _list_errors(log: Log, facts: JsonObject) -> Iterator[_RunMoment]:
     The tracking error is the difference between the actual and the desired joint angles.
     """
     unit = shared_unit(log)
-    peak = find_error_peak(log)
+    peak = JointError.find_largest_of_all(log)
     if peak is not None and peak.value > 0.0:
         joint = peak.joint.removeprefix(f"{peak.site} ")
         text = (

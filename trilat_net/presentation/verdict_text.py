@@ -7,7 +7,7 @@ rose by 0.2 J at 3.1 s, or which premise failed.
 Invariant:
     - Each class of `VerdictFacts` has exactly one function in `FACT_DESCRIBERS`, and each class
       of `premise_quantities` one in `PREMISE_DESCRIBERS`.
-    - A sentence about a premise lists at most `MAX_LISTED_NAMES` arms, links or joints, and
+    - A sentence about a premise lists at most `_MAX_LISTED_NAMES` arms, links or joints, and
       states how many more there are.
     - A sentence about a failed premise explains in plain words what the premise requires.
     - The name of the theorem mentions its premise of continuous time, which no log can show.
@@ -211,7 +211,7 @@ SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {facts.Evidence: 
 """Functions that list the sentences of a finding, keyed by the class of the finding."""
 
 
-MAX_LISTED_NAMES = 4
+_MAX_LISTED_NAMES = 4
 """Maximum number of links or sites listed in a sentence."""
 _OBSTACLES = {
     premise_quantities.FunctionalObstacle.UNKNOWN_PARAMETERS: (
@@ -576,9 +576,9 @@ PREMISE_DESCRIBERS: dict[type, Callable[[Any], str]] = {
 
 
 def _join_limited(items: Sequence[str]) -> str:
-    """Joins strings with commas. Strings beyond `MAX_LISTED_NAMES` are only counted."""
-    text = ", ".join(items[:MAX_LISTED_NAMES])
-    hidden = len(items) - MAX_LISTED_NAMES
+    """Joins strings with commas. Strings beyond `_MAX_LISTED_NAMES` are only counted."""
+    text = ", ".join(items[:_MAX_LISTED_NAMES])
+    hidden = len(items) - _MAX_LISTED_NAMES
     return f"{text} and {hidden} more" if hidden > 0 else text
 
 

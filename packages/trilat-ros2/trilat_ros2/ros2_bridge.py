@@ -53,7 +53,6 @@ from trilat_net.net import (
     SessionMembers,
     State,
     SystemClock,
-    read_messages,
     topics,
 )
 from trilat_net.net.ros2 import ROUTER_ADVICE, Attachment, Refusals, Ros2Graph, TopicPublisher
@@ -653,13 +652,12 @@ class _Bridge:
         self._epoch_unix_ns = epoch_unix_ns
 
         # Messages from the session.
-        records_key = topics.key(session, "*", topics.STATE)
-        events_key = topics.key(session, "*", topics.EVENT)
-        links_key = topics.key(session, "*", topics.LINK)
+        members = SessionMembers(bus, ends.clock, session)
+        self._members = members
+        self._read_records = members.subscribe(State, capacity=INBOX_MESSAGES)
+        self._read_events = members.subscribe(Event, capacity=INBOX_MESSAGES)
+        self._read_statistics = members.subscribe(LinkStats, capacity=INBOX_MESSAGES)
         presence_key = topics.presence_key(session, "*")
-        self._records = bus.inbox(records_key, INBOX_MESSAGES)
-        self._events = bus.inbox(events_key, INBOX_MESSAGES)
-        self._links = bus.inbox(links_key, INBOX_MESSAGES)
         self._presence = bus.presence(presence_key)
         self._present = set[topics.KeyParts]()
         self._has_seen_site = False
@@ -706,8 +704,7 @@ class _Bridge:
         ends = self._ends
         # The changes before the bridge was started determine the site's present shares.
         shares = self._sites[site].shares
-        members = SessionMembers(ends.bus, ends.clock, ends.session)
-        for event in members.list_past_events(site):
+        for event in self._members.list_past_events(site):
             shares.add_change(event.command)
 
         topic = ends.topic(site, "set_dominance")
@@ -792,12 +789,12 @@ class _Bridge:
         Returns:
             True if another session with the same name has begun.
         """
-        for record in read_messages(self._records, State):
+        for record in self._read_records():
             if record.site in self._sites:
                 self._sites[record.site].publish(record, rate_hz)
 
         has_new_epoch = False
-        for event in read_messages(self._events, Event):
+        for event in self._read_events():
             if event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns:
                 has_new_epoch = True
             if event.member in self._sites:
@@ -807,7 +804,7 @@ class _Bridge:
             for name, data in pack_event(event, stamp_ns):
                 self._lines[name].put(data)
 
-        for stats in read_messages(self._links, LinkStats):
+        for stats in self._read_statistics():
             if stats.site in self._sites:
                 self._sites[stats.site].publish_statistics(stats)
 

@@ -18,9 +18,11 @@ import pytest
 from trilat_studies.bench import BenchPlan, plan_bench
 from trilat_studies.bench.bench_plan import BenchCell
 from trilat_studies.bench.bench_results import BenchRun
-from trilat_studies.measure_run import ExpectationResult, LinkAge, RunMetrics
+from trilat_studies.expectations import ExpectationResult
+from trilat_studies.measure_run import RunMetrics
+from trilat_studies.run_statistics import LinkAge
 from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
-from trilat_studies.sweep.stability_map import MapPlane
+from trilat_studies.sweep.map_plane import MapPlane
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_run import FinishedSweep
@@ -31,7 +33,6 @@ from trilat_studies.tuning.tuning_plan import ObjectivePoint
 
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
-from trilat_net.core.lanes import run_groups
 from trilat_net.core.lanes.lane_run import LaneRun
 from trilat_net.own_code.code_consent import allow_own_code
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
@@ -177,12 +178,12 @@ def make_cell_result(text: str, longest_s: float = 4.0) -> CellResult:
 
 def use_single_runs(patch: pytest.MonkeyPatch) -> None:
     """Lets small studies compute their runs one by one, as if no code for lanes were stored."""
-    patch.setattr(run_groups, "has_lane_code", lambda _: False)
+    patch.setattr(LaneRun, "has_stored_code", lambda _: False)
 
 
 def use_lanes(patch: pytest.MonkeyPatch) -> None:
     """Lets studies compute their runs side by side, as if the code for lanes were stored."""
-    patch.setattr(run_groups, "has_lane_code", lambda _: True)
+    patch.setattr(LaneRun, "has_stored_code", lambda _: True)
 
 
 def record_lane_times(patch: pytest.MonkeyPatch) -> list[float]:

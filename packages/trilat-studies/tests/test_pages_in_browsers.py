@@ -14,7 +14,8 @@ from study_builders import (
 from trilat_studies.bench import plan_bench, prepare_bench_folder, run_bench
 from trilat_studies.bench.bench_figures import FIGURES_OF_BENCH, write_bench
 from trilat_studies.sweep.map_page import MapReport
-from trilat_studies.sweep.stability_map import MapLine, MapPlane, StabilityMap
+from trilat_studies.sweep.map_plane import MapPlane
+from trilat_studies.sweep.stability_map import MapLine, StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass
 
 from tests.live.browsers import needs_browser

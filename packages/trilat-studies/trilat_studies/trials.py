@@ -39,7 +39,7 @@ from msgspec.structs import asdict
 from trilat_net.analysis import LogMetrics
 from trilat_net.core import is_core_cached
 from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
-from trilat_net.execution import check_virtual, execute_virtual, verify_log
+from trilat_net.execution import SimulatedLog, execute_virtual, verify_log
 from trilat_net.log import open_log
 from trilat_net.net import SystemClock
 from trilat_net.presentation import Block, MarkedText, TextTable
@@ -47,7 +47,8 @@ from trilat_net.results import Result
 from trilat_net.scenario import ExperimentText, Scenario, load_scenario
 from trilat_net.work import MAX_LOSSES, MeanInterval, WorkerPool, Workers
 
-from .measure_run import ExpectationResult, RunMetrics
+from .expectations import ExpectationResult
+from .measure_run import RunMetrics
 from .run_commands import format_command, list_assignments, set_options
 from .side_by_side import RunKind, describe_runs_alone, prepare_kinds
 
@@ -142,7 +143,7 @@ class Trial(NamedTuple):
         Returns:
             The result of the trial.
         """
-        outcomes = metrics.compare_with(self.scenario.expect)
+        outcomes = ExpectationResult.list_of_run(metrics, self.scenario.expect)
         return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
 
     def run(self) -> TrialResult:
@@ -249,7 +250,7 @@ def trials(
     label = ExperimentText.read(source).label
     _check_expectations_reachable(scenario, label)
     if not live:
-        check_virtual(scenario)
+        SimulatedLog.check_scenario(scenario)
 
     distinct_seeds = list(dict.fromkeys(seeds)) or [scenario.seed]
     for seed in distinct_seeds:

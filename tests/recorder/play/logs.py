@@ -7,7 +7,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from trilat_net.app.play.batch import MessageBatch
-from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, preload_messages
+from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, SessionReader
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
@@ -64,6 +64,6 @@ def write_event_log(
 
 
 def preload_paths(*paths: Path, **selection: Any) -> tuple[SessionHeader, MessageBatch]:
-    header, batch = preload_messages(paths, PlaySelection(**selection), 1 << 28)
+    header, batch = SessionReader(paths, PlaySelection(**selection)).preload(1 << 28)
     assert batch is not None
     return header, batch

@@ -13,7 +13,7 @@ from tests.net.waiting import until
 from tests.recorder.play.logs import preload_paths, write_event_log
 from trilat_net.app.play.batch import BatchBuilder, MessageBatch, PlayedMessage
 from trilat_net.app.play.message_source import MessageSource, feed_player, sort_messages
-from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, preload_messages
+from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, SessionReader
 from trilat_net.errors import LogError, RuntimeFault
 
 
@@ -80,7 +80,7 @@ def test_messages_beyond_the_memory_limit_are_given_early() -> None:
 
 @contextmanager
 def open_source(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionHeader]]:
-    header, _ = preload_messages([path], PlaySelection(), 0)
+    header, _ = SessionReader([path], PlaySelection()).preload(0)
     with closing(MessageSource(header, None)) as source:
         source.start_reader([path], PlaySelection(), loop=loop)
         yield source, header
@@ -133,7 +133,7 @@ def test_unreadable_messages_are_errors_here(
     tmp_path: Path,
 ) -> None:
     path = write_event_log(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
-    header, _ = preload_messages([path], PlaySelection(), 0)
+    header, _ = SessionReader([path], PlaySelection()).preload(0)
     with closing(MessageSource(header, None)) as source:
         source.start_reader([path], PlaySelection(), loop=True)
         happens(source, path)

@@ -19,21 +19,21 @@ from trilat_net.app.play.play_process import (
     Playback,
     PlaybackSummary,
     PlayOptions,
-    map_key_to_session,
 )
 from trilat_net.app.play.player import PlayProgress
-from trilat_net.app.play.session_reader import PlaySelection, preload_messages
+from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, SessionReader
 from trilat_net.errors import SessionError
 from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.log.message_identity import compute_virtual_boot
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
-from trilat_net.net.membership import Epoch, EventPublisher, liveliness_token
+from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, Info, State
 from trilat_net.net.requests import Backfill, BackfillRequest, Pong
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.session_members import SessionMembers
 from trilat_net.net.wire import decode, encode
+from trilat_net.scenario import load_scenario
 
 from .clocks import LookedAt
 
@@ -76,7 +76,7 @@ class Hall:
         return self.watcher.query(topics.key(self.options.session, member, channel), payload)
 
     def play(self) -> PlaybackSummary:
-        self.facts, block = preload_messages([self.log], self.selection, 1 << 28)
+        self.facts, block = SessionReader([self.log], self.selection).preload(1 << 28)
         bus = self.network.join()
         replay = Playback(
             bus,
@@ -102,7 +102,7 @@ class Scribe:
         session = hall.options.session
         info = answer_info(topics.RECORDER, RECORDER_BOOT)
         bus.respond(topics.key(session, topics.RECORDER, topics.INFO), lambda _: encode(info))
-        bus.announce(liveliness_token(session, topics.RECORDER, RECORDER_BOOT))
+        bus.announce(topics.presence_token(session, topics.RECORDER, RECORDER_BOOT))
         publish = bus.publisher(topics.key(session, topics.RECORDER, topics.EVENT))
 
         def hear(_: str, payload: bytes) -> None:
@@ -172,7 +172,9 @@ def test_the_sites_tokens_stand_while_it_plays(log_file: Path) -> None:
     seen: list[tuple[str, bool]] = []
     hall.acts = {1: lambda: seen.extend(drained(hall.presence))}  # type: ignore[arg-type]
     hall.play()
-    tokens = {liveliness_token(SESSION, name, boot) for name, boot in hall.facts.boots.items()}
+    tokens = {
+        topics.presence_token(SESSION, name, boot) for name, boot in hall.facts.boots.items()
+    }
     assert set(seen) == {(key, True) for key in tokens}
     assert set(drained(hall.presence)) == {(key, False) for key in tokens}  # type: ignore[arg-type]
 
@@ -328,4 +330,6 @@ def test_existing_sessions_are_refused() -> None:
     ],
 )
 def test_keys_use_the_new_session_name(topic: str, key: str) -> None:
-    assert map_key_to_session(topic, "paper", "again") == key
+    scenario = load_scenario("paper")
+    header = SessionHeader("paper", scenario, scenario.text, fingerprint="", version=0)
+    assert header.map_topic(topic, "again") == key

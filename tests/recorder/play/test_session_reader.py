@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.log.builders import write_log
 from tests.recorder.play.logs import encode_event, preload_paths, read_payloads, write_event_log
-from trilat_net.app.play.session_reader import PlaySelection, preload_messages
+from trilat_net.app.play.session_reader import PlaySelection, SessionReader
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.log.message_identity import compute_virtual_boot
@@ -95,7 +95,7 @@ def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
     with pytest.raises(
         LogError, match=r"3\.mcap belongs to a different session from .*1\.mcap"
     ):
-        preload_messages([first_part, other], PlaySelection(), LARGE)
+        SessionReader([first_part, other], PlaySelection()).preload(LARGE)
 
 
 def test_torn_files_are_read_while_whole(short_log: bytes, tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_torn_files_are_read_while_whole(short_log: bytes, tmp_path: Path) -> No
 
 def test_large_logs_are_read_while_playing(log_file: Path) -> None:
     for limit_bytes in (0, 50_000):
-        facts, block = preload_messages([log_file], PlaySelection(), limit_bytes)
+        facts, block = SessionReader([log_file], PlaySelection()).preload(limit_bytes)
         assert block is None
         assert facts.session == "paper"
         assert set(facts.boots) == {"m1", "m2", "s"}
@@ -131,7 +131,7 @@ def test_empty_selections_explain_the_choice(
     selection: PlaySelection, problem: str, log_file: Path
 ) -> None:
     with pytest.raises(UsageError, match=problem):
-        preload_messages([log_file], selection, LARGE)
+        SessionReader([log_file], selection).preload(LARGE)
 
 
 def test_nonsense_stamps_are_replaced_by_arrival_times(tmp_path: Path) -> None:

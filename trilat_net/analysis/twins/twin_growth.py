@@ -30,15 +30,6 @@ import numpy as np
 
 from ...core import BUCKETS_PER_S, Array
 from ...errors import NotRepeatable, UsageError
-from ...execution import (
-    LEAST_PUSH,
-    MOST_PUSH,
-    PUSH_RAD,
-    SMALLEST,
-    Push,
-    TwinPath,
-    Twins,
-)
 from ...hooks import find_hook
 from ...log import Log
 from ...results import Result, finite_or_none
@@ -47,6 +38,15 @@ from ..delay_period import DelayPeriod, find_burst_interval_s
 from ..run_end import RunEnd, find_coupled_sites
 from ..torque_sources import VirtualWall
 from .envelope_trend import EnvelopeFit, EnvelopeTrend
+from .twin_runs import (
+    LEAST_PUSH,
+    MOST_PUSH,
+    PUSH_RAD,
+    SMALLEST,
+    Push,
+    TwinPath,
+    Twins,
+)
 
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""
@@ -71,7 +71,7 @@ _AMPLITUDE_FLOOR = 1e-300
 """Smallest amplitude in a fit. The amplitudes are scaled and have no unit."""
 SAME_SCALED = math.log(1.1)
 """Largest difference between the logarithms of two scaled twins that count as equal: 10 %."""
-MOST_LOG = 700.0
+_MOST_LOG = 700.0
 """Largest argument of the exponential function that certainly does not overflow."""
 
 
@@ -723,7 +723,7 @@ def _rank_badness(growth: PushGrowth) -> tuple[int, float]:
 
 def _exp(logarithm: float) -> float:
     """Returns the exponential of a number, or infinity if it would overflow."""
-    return math.exp(logarithm) if not logarithm > MOST_LOG else math.inf
+    return math.exp(logarithm) if not logarithm > _MOST_LOG else math.inf
 
 
 def _find_departures(

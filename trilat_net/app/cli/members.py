@@ -355,7 +355,7 @@ def replay_command(
     """
     from trilat_net.app.play.play_process import PlayOptions, play_log
     from trilat_net.app.play.player import Pace
-    from trilat_net.app.play.session_reader import PlaySelection, preload_messages
+    from trilat_net.app.play.session_reader import PlaySelection, SessionReader
 
     from ...net import DefaultEndpoints
 
@@ -373,7 +373,7 @@ def replay_command(
     speed = Pace.parse_rate(rate)
     preload_bytes = preload << 20
     with terminal.progress_bar(f"reading {files[0]}") as progress:
-        header, block = preload_messages(files, selection, preload_bytes, progress)
+        header, block = SessionReader(files, selection, progress).preload(preload_bytes)
 
     prefixed_name = f"{prefix}-{header.session}" if prefix else header.session
     name = options.check_session_name(session or prefixed_name)

@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 from trilat_net import process
 from trilat_net.errors import UsageError
-from trilat_net.net import topics
 from trilat_net.records import NS_PER_S
 
 from ...net import Bus, Clock, Connection, SessionMembers
@@ -147,9 +146,7 @@ class Playback:
 
     def _make_publisher(self, channel: int) -> Callable[[bytes], None]:
         """Returns the function that publishes messages of a channel, by its number."""
-        key = map_key_to_session(
-            self.header.topics[channel], self.header.session, self.options.session
-        )
+        key = self.header.map_topic(self.header.topics[channel], self.options.session)
         return self.bus.publisher(key, patient=True)
 
     def _serve(self, progress: PlayProgress) -> None:
@@ -368,21 +365,3 @@ def _open_bus(
             SessionMembers(bus, clock, session).require_absent(stopped)
             stack.pop_all()  # the connection stays open
     return bus
-
-
-def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
-    """Returns the key under which a log channel is published in the playback's session.
-
-    The recorded session's name is replaced with that of the playback's session. A topic that
-    does not belong to the recorded session is appended in full to the playback's session name,
-    so that it cannot collide with another topic.
-
-    Args:
-        topic: Topic of the channel in the log.
-        recorded_session: Name of the recorded session.
-        session: Name of the playback's session.
-    """
-    name_parts = topic.strip("/").split("/")
-    if name_parts[:2] == [topics.ROOT, recorded_session]:
-        name_parts = name_parts[2:]
-    return "/".join([topics.ROOT, session, *name_parts])

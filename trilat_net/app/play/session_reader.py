@@ -29,7 +29,6 @@ from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, parse_embedded
 
 from ...log import (
-    ALL_CHANNELS,
     SCENARIO,
     SESSION,
     SITE_CHANNELS,
@@ -58,7 +57,7 @@ class PlaySelection:
         time: Whether the sending time or the arrival time of a message is used.
     """
 
-    channels: ChannelFilter = ALL_CHANNELS
+    channels: ChannelFilter = field(default_factory=ChannelFilter)
     start_ns: int | None = None
     stop_ns: int | None = None
     time: PlayTime = "publish"
@@ -167,7 +166,7 @@ numbers would repeat, because each start numbers its events from 0.
 """
 
 
-class _PayloadHeader(msgspec.Struct):
+class PayloadHeader(msgspec.Struct):
     """The few fields of a message that the player decodes.
 
     They exist in all versions of the message format, so that old logs can be replayed.
@@ -180,16 +179,16 @@ class _PayloadHeader(msgspec.Struct):
     boot: int = -1
     n: int = -1
 
+    @staticmethod
+    def decode(payload: bytes) -> "PayloadHeader":
+        """Decodes the fields of a message. They keep their defaults if that is not possible."""
+        try:
+            return _decoder.decode(payload)
+        except (ValueError, RecursionError):
+            return PayloadHeader()
 
-_decoder = msgspec.msgpack.Decoder(_PayloadHeader)
 
-
-def _decode_header(payload: bytes) -> _PayloadHeader:
-    """Decodes the boot and the number of a message. Both are -1 if that is not possible."""
-    try:
-        return _decoder.decode(payload)
-    except (ValueError, RecursionError):
-        return _PayloadHeader()
+_decoder = msgspec.msgpack.Decoder(PayloadHeader)
 
 
 @dataclass(slots=True)
@@ -220,6 +219,22 @@ class SessionHeader:
     torn: dict[Path, str] = field(default_factory=dict)
     first_ns: int = 2**62
     last_ns: int = -(2**62)
+
+    def map_topic(self, topic: str, session: str) -> str:
+        """Returns the key under which a channel of the log is published in another session.
+
+        The name of the recorded session is replaced with that of the other session. A topic
+        that does not belong to the recorded session is appended in full to the name of the
+        other session, so that it cannot collide with another topic.
+
+        Args:
+            topic: Topic of the channel in the log.
+            session: Name of the other session.
+        """
+        name_parts = topic.strip("/").split("/")
+        if name_parts[:2] == [topics.ROOT, self.session]:
+            name_parts = name_parts[2:]
+        return "/".join([topics.ROOT, session, *name_parts])
 
 
 class _PlayedChannel:
@@ -291,7 +306,7 @@ class _PlayedChannel:
         if self.kind != topics.EVENT:
             return t_ns
 
-        header = _decode_header(payload)
+        header = PayloadHeader.decode(payload)
         event_index = self._event_count
         self._event_count += 1
         has_number = header.n >= 0
@@ -339,6 +354,47 @@ class SessionReader:
                 reader = McapReader(stream, str(path), self._progress, kept=False)
                 yield from self._read_file(path, reader)
 
+    def preload(self, limit_bytes: int) -> tuple[SessionHeader, MessageBatch | None]:
+        """Reads the header of the session, and its selected messages if they fit in memory.
+
+        A short log is played from memory. If the messages need more memory than allowed, they
+        are left to a reader process that is started later, and the file is searched only for
+        the first messages of all sites.
+
+        Args:
+            limit_bytes: Memory limit for the messages, in bytes.
+
+        Returns:
+            The description of the session, and the messages in playback order, or `None` in
+            place of the messages if they need more memory.
+
+        Raises:
+            LogError: A file is missing, or is not a log of trilat-net.
+            UsageError: No message is selected.
+        """
+        waiting = BatchBuilder()
+        first_path = self._paths[0]
+        with process.pause_gc():
+            messages = self.messages()
+            for message in messages:
+                waiting.add(*message)
+                if waiting.memory > limit_bytes:
+                    break
+            else:  # the end of the files was reached
+                if self.header is None:
+                    raise LogError(f"{first_path} is empty")
+                if not waiting.memory:
+                    reason = _describe_empty_selection(first_path, self._selection, self.header)
+                    raise UsageError(reason)
+                return self.header, waiting.ordered()
+
+            # The messages do not fit. Read on until the first message of each site.
+            assert self.header is not None  # there was a message
+            for _ in islice(messages, SEARCH_LIMIT):
+                if self.header.boots.keys() >= self.header.scenario.sites.keys():
+                    break
+        return self.header, None
+
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
         """Yields the messages of a log file that are replayed, and completes the header.
 
@@ -376,7 +432,7 @@ class SessionReader:
             # The first message of a site contains the boot, the random number of the site's
             # start.
             if channel.site and channel.site not in header.boots:
-                boot = _decode_header(item.payload).boot
+                boot = PayloadHeader.decode(item.payload).boot
                 if boot >= 0:
                     header.boots[channel.site] = boot
 
@@ -455,56 +511,6 @@ SEARCH_LIMIT = 100_000
 """Number of further messages, beyond those that fit into memory, that are searched for starts
 of sites.
 """
-
-
-def preload_messages(
-    paths: Sequence[Path],
-    selection: PlaySelection,
-    limit_bytes: int,
-    progress: Progress | None = None,
-) -> tuple[SessionHeader, MessageBatch | None]:
-    """Reads the description of a session, and its selected messages if they fit in memory.
-
-    A short log is played from memory. If the messages need more memory than allowed, they are
-    left to a reader process that is started later, and the file is searched only for the first
-    messages of all sites.
-
-    Args:
-        paths: The files of the log.
-        selection: Which messages are played.
-        limit_bytes: Memory limit for the messages, in bytes.
-        progress: Function that is called periodically with the number of bytes read and the
-            total number of bytes.
-
-    Returns:
-        The description of the session, and the messages in playback order, or `None` in place
-        of the messages if they need more memory.
-
-    Raises:
-        LogError: A file is missing, or is not a log of trilat-net.
-        UsageError: No message is selected.
-    """
-    reader = SessionReader(paths, selection, progress)
-    waiting = BatchBuilder()
-    with process.pause_gc():
-        messages = reader.messages()
-        for message in messages:
-            waiting.add(*message)
-            if waiting.memory > limit_bytes:
-                break
-        else:  # the end of the files was reached
-            if reader.header is None:
-                raise LogError(f"{paths[0]} is empty")
-            if not waiting.memory:
-                raise UsageError(_describe_empty_selection(paths[0], selection, reader.header))
-            return reader.header, waiting.ordered()
-
-        # The messages do not fit. Read on until the first message of each site.
-        assert reader.header is not None  # there was a message
-        for _ in islice(messages, SEARCH_LIMIT):
-            if reader.header.boots.keys() >= reader.header.scenario.sites.keys():
-                break
-    return reader.header, None
 
 
 def _describe_empty_selection(

@@ -18,13 +18,11 @@ Invariant:
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection
-from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from trilat_net.errors import WireError
 from trilat_net.net import topics
 
 from ...log import Ints
@@ -36,11 +34,9 @@ from ...net import (
     Event,
     SessionMembers,
     SiteStandIn,
-    decode,
-    read_messages,
 )
 from .batch import MessageBatch
-from .session_reader import NUMBERS_OF_A_START, SessionHeader
+from .session_reader import NUMBERS_OF_A_START, PayloadHeader, SessionHeader
 
 
 class _ChannelMessages(NamedTuple):
@@ -209,9 +205,10 @@ class SiteStandIns:
         self._header = header
         self._history = history
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
-        recorder_events = topics.key(session, topics.RECORDER, topics.EVENT)
-        self._recorder_events = bus.inbox(recorder_events, _MAX_RECORDER_EVENTS)
-        self._recorder_query = SessionMembers(bus, clock, session, topics.RECORDER)
+        self._recorder_members = SessionMembers(bus, clock, session, topics.RECORDER)
+        self._read_recorder_events = self._recorder_members.subscribe(
+            Event, capacity=_MAX_RECORDER_EVENTS
+        )
         # Sites whose messages are stored completely, by the boot of the recorder.
         self._stored: dict[str, set[str]] = {}
         # Boots of the recorders that have sent their identity.
@@ -272,7 +269,7 @@ class SiteStandIns:
                 self.recorders.add(token.boot)
             else:
                 self.recorders.discard(token.boot)
-        for event in read_messages(self._recorder_events, Event):
+        for event in self._read_recorder_events():
             if event.kind == "stored":
                 stored_sites = self._stored.setdefault(str(event.boot), set())
                 stored_sites.add(event.about)
@@ -287,7 +284,7 @@ class SiteStandIns:
 
         A recorder is ready once it has replied.
         """
-        self._listening |= {str(info.boot) for info in self._recorder_query.poll()}
+        self._listening |= {str(info.boot) for info in self._recorder_members.poll()}
         return not self.recorders - self._listening
 
     def have_stored(self, recorders: Collection[str]) -> bool:
@@ -349,8 +346,9 @@ class SiteStandIns:
             # At most one event is requested, so that the list has at most one entry.
             _, payloads = self._history.find_messages(channel, newest_event, newest_event)
             for payload in payloads:
-                with suppress(WireError):  # an event of a damaged log may be unreadable
-                    self._boots[site] = (start_index, decode(payload, Event).boot)
+                header = PayloadHeader.decode(payload)
+                if header.boot >= 0:  # an event of a damaged log may be unreadable
+                    self._boots[site] = (start_index, header.boot)
         return self._boots.get(site, first_start)
 
     def _find_boot(self, site: str) -> int:

@@ -26,9 +26,9 @@ from ..step.ticks import tick_ns
 from ..step.vectors import Array, IntArray
 from .lane_deliveries import BLOCK_TICKS, DrawAddresses, LinkStates, use_samples
 from .lane_rows import LANES, LaneNumbers, Words, allocate_words, pointer_to, read_words
-from .lane_run import LaneRun, explain_uncompilable, find_words, put_rows, view_rows
+from .lane_run import LaneRun, find_words, put_rows, view_rows
 from .lane_stages import EndedRuns, call_site, copy_lane, keep_ended_runs
-from .lane_structure import RunStructure, find_obstacle
+from .lane_structure import RunStructure
 from .run_groups import LEAST_RUNS
 
 _CLOCK = LaneNumbers()
@@ -292,8 +292,8 @@ class LaneEpisodes(LaneRun):
             return f"steps of more than {BLOCK_TICKS} ticks"
         return SeveralHands.explain(rules, period_ticks, largest_action)
 
-    @staticmethod
-    def explain_run(run: CompiledRun, hand_site: int) -> str:
+    @classmethod
+    def explain_run(cls, run: CompiledRun, hand_site: int) -> str:
         """Explains why a run cannot be simulated side by side with others.
 
         Returns an empty string if it can. This compiles the simulation code to find out, which
@@ -303,10 +303,10 @@ class LaneEpisodes(LaneRun):
             run: The run before its first tick.
             hand_site: Index of the site whose arm is moved by a program.
         """
-        obstacle = find_obstacle(run, hand_site=hand_site)
+        obstacle = RunStructure.find_obstacle(run, hand_site=hand_site)
         if len(set(run.memory.tables.site["rate_hz"].ravel().tolist())) > 1:
             obstacle = obstacle or "tick rates that differ between sites"
-        return obstacle or explain_uncompilable(run, _CLOCK)
+        return obstacle or cls.explain_uncompilable(run)
 
     def load(self, lane: int, run: CompiledRun, rules: HandRules) -> None:
         """Starts a new reinforcement learning episode in the lane of one that has ended.

@@ -231,7 +231,7 @@ def _find_code(
     layout: _LaneLayout,
     structure: RunStructure,
     site: SiteStructure,
-    clock: types.Type = types.int64,
+    clock: types.Type,
 ) -> LaneCode:
     """Returns the code of one control period of a site. The arguments determine the types.
 
@@ -242,59 +242,6 @@ def _find_code(
         clock: Type of the tick and of its nominal time, see `_list_argument_types`.
     """
     return LaneCode(_choose_code(layout), _list_argument_types(layout, structure, site, clock))
-
-
-def _find_addresses(run: CompiledRun, structure: RunStructure, clock: types.Type) -> IntArray:
-    """Returns the address of the compiled code that computes a tick, for each site.
-
-    The code computes a tick for several runs at once. It is compiled if it is not yet stored on
-    disk.
-
-    Args:
-        run: One of the runs.
-        structure: The structure shared by all of these runs, see `RunStructure`.
-        clock: Numba type of the ticks, see `_list_argument_types`.
-
-    Raises:
-        NumbaError: A user's law cannot be compiled for several runs at once.
-    """
-    layout = _find_layout(run)
-    codes = [_find_code(layout, structure, site, clock) for site in structure.sites]
-    return np.array([code.find_address() for code in codes])
-
-
-def explain_uncompilable(run: CompiledRun, clock: types.Type = types.int64) -> str:
-    """Explains to the user why a control law cannot be compiled for several runs at once.
-
-    Such a law may still be compilable for a single run. This compiles the code to find out.
-
-    Args:
-        run: The run before its first tick. `find_obstacle` must have found no obstacle to
-            computing it in a lane.
-        clock: Type of the ticks, see `_list_argument_types`.
-
-    Returns:
-        The reason, or an empty string if all laws can be compiled.
-    """
-    try:
-        _find_addresses(run, RunStructure.find(run), clock)
-    except NumbaError:
-        return "control laws that cannot be compiled side by side"
-    return ""
-
-
-def read_assembly(run: CompiledRun, i: int) -> str:
-    """Returns the assembly code for one arm, for tests.
-
-    The tests check that it contains vector instructions, without which the simulation is slow.
-
-    Args:
-        run: The run.
-        i: Index of the site.
-    """
-    structure = RunStructure.find(run)
-    layout = _find_layout(run)
-    return _find_code(layout, structure, structure.sites[i]).read_assembly()
 
 
 @leaf
@@ -314,19 +261,6 @@ def _copy_records(first: IntArray, kept: Array, records: Array) -> None:
             for lane in range(records.shape[0]):
                 for column in range(records.shape[3]):
                     records[lane, i, tick, column] = kept[i, row, column, lane]
-
-
-def has_lane_code(run: CompiledRun) -> bool:
-    """Returns True if the code that simulates a run in lanes is already stored on disk.
-
-    Without stored code, the runs can only start after a compilation that takes some time.
-
-    Args:
-        run: The run. `find_obstacle` must have found no obstacle to computing it in a lane.
-    """
-    structure = RunStructure.find(run)
-    layout = _find_layout(run)
-    return all(_find_code(layout, structure, site).is_stored() for site in structure.sites)
 
 
 class _LinksOfRun:
@@ -415,7 +349,7 @@ class LaneRun:
 
     Args:
         runs: The runs before their first tick, at most `LANES`. They must have the same
-            structure, see `RunStructure`, and no obstacle, see `find_obstacle`.
+            structure, see `RunStructure`, and no obstacle, see `RunStructure.find_obstacle`.
         record_rows: Number of latest records kept per site, a power of two.
 
     Attributes:
@@ -424,6 +358,48 @@ class LaneRun:
     """
 
     clock: types.Type = types.int64
+
+    @classmethod
+    def list_code(cls, run: CompiledRun) -> list[LaneCode]:
+        """Returns the code with which a run is simulated in a lane, one object per site.
+
+        Args:
+            run: The run. `RunStructure.find_obstacle` must have found no obstacle to computing
+                it in a lane.
+        """
+        structure = RunStructure.find(run)
+        layout = _find_layout(run)
+        return [_find_code(layout, structure, site, cls.clock) for site in structure.sites]
+
+    @classmethod
+    def has_stored_code(cls, run: CompiledRun) -> bool:
+        """Returns True if the code that simulates a run in lanes is already stored on disk.
+
+        Without stored code, the runs can only start after a compilation that takes some time.
+
+        Args:
+            run: The run, see `list_code`.
+        """
+        return all(code.is_stored() for code in cls.list_code(run))
+
+    @classmethod
+    def explain_uncompilable(cls, run: CompiledRun) -> str:
+        """Explains to the user why a control law cannot be compiled for several runs at once.
+
+        Such a law may still be compilable for a single run. This compiles the code to find out.
+
+        Args:
+            run: The run before its first tick, see `list_code`.
+
+        Returns:
+            The reason, or an empty string if all laws can be compiled.
+        """
+        try:
+            for code in cls.list_code(run):
+                code.find_address()
+        except NumbaError:
+            return "control laws that cannot be compiled side by side"
+        return ""
 
     def __init__(self, runs: Sequence[CompiledRun], record_rows: int = 1) -> None:
         assert 0 < len(runs) <= LANES
@@ -478,7 +454,9 @@ class LaneRun:
         self._ended = self._allocate_ended()
         for lane, arrays in enumerate(tables):
             self._put_first_states(lane, arrays)
-        self._addresses = _find_addresses(runs[0], structure, self.clock)
+        # The code is compiled if it is not yet stored on disk.
+        codes = [_find_code(layout, structure, site, self.clock) for site in structure.sites]
+        self._addresses: IntArray = np.array([code.find_address() for code in codes])
         most_sources = len(self._actors) // self._sites
         self._hands = _find_recorded_hands(memories[0].feed, layout.actor, most_sources)
 

@@ -3,7 +3,7 @@
 Vector instructions evaluate the same equations for several runs. Runs can therefore be computed
 together if they differ only in numerical values, such as gains or start poses. Properties that
 select the equations, for example the type of control law, form the structure of a run.
-`find_obstacle` explains why a run must be computed alone.
+`RunStructure.find_obstacle` explains why a run must be computed alone.
 
 Invariant:
     - Two runs with the same structure use the same compiled code and the same data tables.
@@ -111,6 +111,33 @@ class RunStructure(NamedTuple):
             settled_rad=memory.settled_rad,
         )
 
+    @staticmethod
+    def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
+        """Explains to the user why a run cannot be simulated side by side with other runs.
+
+        Args:
+            run: The run before its first tick.
+            hand_site: Index of a site whose live operator is replaced by the caller, who knows
+                this operator's actions. -1 if there is no such site.
+
+        Returns:
+            The property of the run that lanes do not support, or an empty string if lanes
+            support the run.
+        """
+        config: Any = numba.config
+        tables = run.memory.tables
+        if config.DISABLE_JIT:
+            return "Numba is disabled"
+        if run.memory.has_plain_law:
+            return "control laws in plain Python"
+        if run.programmed_sites - {hand_site}:
+            return "programs that move an arm"
+
+        kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
+        if kinds.intersection(OWN_KINDS):
+            return "user-written operators or environments"
+        return ""
+
 
 def _read_constants(row: np.void, names: tuple[str, ...]) -> Constants:
     """Returns integer fields of a row as pairs of name and value."""
@@ -120,33 +147,6 @@ def _read_constants(row: np.void, names: tuple[str, ...]) -> Constants:
 def _list_actors(actors: Any) -> list[Any]:
     """Returns the rows of a site's torque sources, excluding rows that only pad the array."""
     return [row for row in actors if row["sampled"] in (0, 1)]
-
-
-def find_obstacle(run: CompiledRun, *, hand_site: int = -1) -> str:
-    """Explains to the user why a run cannot be simulated side by side with other runs.
-
-    Args:
-        run: The run before its first tick.
-        hand_site: Index of a site whose live operator is replaced by the caller, who knows this
-            operator's actions. -1 if there is no such site.
-
-    Returns:
-        The property of the run that lanes do not support, or an empty string if lanes support
-        the run.
-    """
-    config: Any = numba.config
-    tables = run.memory.tables
-    if config.DISABLE_JIT:
-        return "Numba is disabled"
-    if run.memory.has_plain_law:
-        return "control laws in plain Python"
-    if run.programmed_sites - {hand_site}:
-        return "programs that move an arm"
-
-    kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
-    if kinds.intersection(OWN_KINDS):
-        return "user-written operators or environments"
-    return ""
 
 
 def _list_prismatic(chain: Any, i: int, joints: int) -> tuple[int, ...]:

@@ -15,8 +15,8 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 
 from ..step.compiled_run import CompiledRun
 from .lane_rows import LANES
-from .lane_run import LaneRun, explain_uncompilable, has_lane_code
-from .lane_structure import RunStructure, find_obstacle
+from .lane_run import LaneRun
+from .lane_structure import RunStructure
 
 LEAST_RUNS = 4
 """Number of runs from which lanes are faster than running them one by one."""
@@ -114,7 +114,7 @@ class RunGroup:
         """
         groups: dict[RunStructure, list[int]] = {}
         for index, run in enumerate(runs):
-            obstacle = find_obstacle(run)
+            obstacle = RunStructure.find_obstacle(run)
             if obstacle:
                 yield RunGroup([index], [run], in_lanes=False, obstacle=obstacle)
             else:
@@ -127,7 +127,7 @@ class RunGroup:
                 chosen = [runs[index] for index in members]
                 obstacle = ""
                 if len(members) >= LEAST_RUNS:
-                    obstacle = explain_uncompilable(chosen[0])
+                    obstacle = LaneRun.explain_uncompilable(chosen[0])
                     if not obstacle:
                         yield RunGroup(members, chosen, in_lanes=True, record_rows=record_rows)
                         continue
@@ -153,9 +153,9 @@ class RunGroup:
         """
         probes = [make_run() for _ in range(LEAST_RUNS)]
         site_ticks = runs * probes[0].duration_s * sum(probes[0].rates_hz)
-        if runs < LEAST_RUNS or find_obstacle(probes[0]):
+        if runs < LEAST_RUNS or RunStructure.find_obstacle(probes[0]):
             return False
-        if site_ticks < least_site_ticks and not has_lane_code(probes[0]):
+        if site_ticks < least_site_ticks and not LaneRun.has_stored_code(probes[0]):
             return False
         for group in RunGroup.divide(probes):
             group.advance_to(1.0 / max(probes[0].rates_hz))
@@ -174,4 +174,4 @@ class RunGroup:
             The structure of the run, or, if the run must be computed alone, the reason for
             that.
         """
-        return find_obstacle(run) or RunStructure.find(run)
+        return RunStructure.find_obstacle(run) or RunStructure.find(run)

@@ -24,8 +24,8 @@ from ..step.ticks import first_tick_at
 from ..step.vectors import Array, IntArray
 from .lane_deliveries import use_recorded_samples
 from .lane_rows import LANES, Words
-from .lane_run import LaneRun, has_lane_code
-from .lane_structure import find_obstacle
+from .lane_run import LaneRun
+from .lane_structure import RunStructure
 from .run_groups import LEAST_RUNS
 
 
@@ -49,8 +49,10 @@ class TwinLanes(LaneRun):
         then simulates the runs again, one by one.
         """
 
-    @staticmethod
-    def suits(run: CompiledRun, runs: int, ticks: Sequence[int], least_site_ticks: int) -> bool:
+    @classmethod
+    def suits(
+        cls, run: CompiledRun, runs: int, ticks: Sequence[int], least_site_ticks: int
+    ) -> bool:
         """Returns True if a run and its twins are computed faster together than one by one.
 
         Computing them together, with vector instructions, requires that all features of the
@@ -64,10 +66,10 @@ class TwinLanes(LaneRun):
             least_site_ticks: Number of simulated ticks, summed over all sites and runs, from
                 which compiling the code pays off.
         """
-        if not LEAST_RUNS <= runs <= LANES or find_obstacle(run):
+        if not LEAST_RUNS <= runs <= LANES or RunStructure.find_obstacle(run):
             return False
         site_ticks = runs * sum(ticks)
-        return site_ticks >= least_site_ticks or has_lane_code(run)
+        return site_ticks >= least_site_ticks or cls.has_stored_code(run)
 
     def __init__(
         self,

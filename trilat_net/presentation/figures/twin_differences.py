@@ -14,6 +14,7 @@ Invariant:
 
 import textwrap
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from ...analysis import (
-    MOST_LOG,
+    SMALLEST,
     EnvelopeTrend,
     PushedTwins,
     PushGrowth,
@@ -32,7 +33,7 @@ from ...analysis import (
     TwinGrowth,
 )
 from ...core import BUCKETS_PER_S, Array
-from ...execution import SMALLEST, FusedRun, TwinPath, Twins
+from ...execution import FusedRun
 from ...log import Log
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
@@ -44,6 +45,8 @@ _SEVERAL_JOINTS_COLOUR = "#7a7a7a"
 """Colour of pushes that move several joints."""
 _ESTIMATES_COLOUR = "#999933"
 """Colour of pushes that change parameter estimates instead of velocities."""
+_MOST_LOG = 700.0
+"""Logarithm at which a line is cut off. The exponential of a larger number might overflow."""
 _ROUNDING: dict[str, Any] = {
     "color": style.FAINT,
     "alpha": 0.18,
@@ -70,14 +73,18 @@ class _DifferenceLine(NamedTuple):
 
     Attributes:
         label: Label of the line in the legend.
-        path: Difference between the repetition (twin) and the run over time.
+        t_s: Times of the plotted values, in s, shape (K,).
+        leg_starts: Indices of the values at which the repetition (twin) was pushed.
+        is_rated: True if the growth rate of the twin is drawn.
         log_amplitude: Logarithm of the plotted amplitude in rad/s over time, for one joint or
             for all joints, shape (K,).
         options: Colour, width and dash pattern of the line.
     """
 
     label: str
-    path: TwinPath
+    t_s: Array
+    leg_starts: tuple[int, ...]
+    is_rated: bool
     log_amplitude: Array
     options: dict[str, Any]
 
@@ -104,11 +111,11 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     with style.time_figure(pushed.log, form, height_in) as plot:
         panels = style.add_panels(plot.figure, 2, 1, sharex=True, height_ratios=(4.0, 1.0))
         upper_panel, lower_panel = panels[:, 0]
-        lines = list(_list_lines(pushed, growth.twins))
         # The growth rate is drawn for the push that the title is about. If pushes of several
         # sizes were tried, the title is about all of them, and the first push is chosen.
         has_several_sizes = pushed.linear is not None
         rated_push = growth.pushes[0] if has_several_sizes else growth.worst
+        lines = list(_list_lines(pushed, rated_push))
         _draw_differences(upper_panel, pushed, lines, rated_push)
         _limit_differences(upper_panel, form)
         _mark_push(upper_panel, pushed.at_s, form)
@@ -116,7 +123,7 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
         # The time axis begins a little before the push, so that its line is visible.
         margin_s = 0.08 * (growth.to_s - pushed.at_s)
         from_s = max(0.0, pushed.at_s - margin_s)
-        _draw_speeds(lower_panel, pushed.log, growth.twins, from_s)
+        _draw_speeds(lower_panel, pushed, from_s)
 
         plot.mark(upper_panel, pushed.log.sites)
         legend_entries = [(line.label, line.options) for line in lines]
@@ -139,7 +146,7 @@ def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
     return draw_twins(PushedTwins(log, 0.0, growth), form)
 
 
-def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
+def _list_lines(pushed: PushedTwins, rated: PushGrowth) -> Iterator[_DifferenceLine]:
     """Yields the lines of the panel that shows the differences between twins and their run.
 
     - If pushes of several sizes were tried in order to find those that act linearly, each size
@@ -148,10 +155,11 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
     - A single push has one line per joint that it moved.
 
     Args:
-        pushed: The run and its pushed twins.
-        twins: The twins of `pushed`, each with its push and its difference from the run over
-            time.
+        pushed: The run and its pushed twins. There is at least one twin.
+        rated: Growth of the push whose rate is drawn.
     """
+    twins = pushed.growth.twins
+    assert twins is not None
     joint_styles = _style_joints(pushed.log, twins.joints)
     shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(twins.paths)))
     has_several_sizes = pushed.linear is not None
@@ -162,9 +170,15 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
         # The name of a push is for example "1e-06 rad at m1 joint 1", "1e-06 rad at all joints"
         # or "1e-06 of all estimates". Only a push of joints has a target after "at".
         size, _, pushed_joints = path.push.name.partition(" at ")
+        make_line = partial(
+            _DifferenceLine,
+            t_s=path.t_s,
+            leg_starts=path.pushed,
+            is_rated=path.push is rated.push,
+        )
         if has_several_sizes:
             shade = {"color": tuple(shades[number]), "linewidth": 1.3}
-            yield _DifferenceLine(size, path, log_amplitudes[number], shade)
+            yield make_line(label=size, log_amplitude=log_amplitudes[number], options=shade)
         elif len(twins.paths) > 1:
             style_without_joint = {
                 "color": _SEVERAL_JOINTS_COLOUR if pushed_joints else _ESTIMATES_COLOUR,
@@ -172,14 +186,18 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
                 "linestyle": style.DASHES[number % len(style.DASHES)],
             }
             options = joint_styles.get(pushed_joints, style_without_joint)
-            yield _DifferenceLine(path.push.name, path, log_amplitudes[number], options)
+            yield make_line(
+                label=path.push.name, log_amplitude=log_amplitudes[number], options=options
+            )
         else:
             for joint, name in enumerate(twins.joints):
                 # The logarithm of the difference is -inf while the joint has not moved.
                 has_moved = np.isfinite(path.largest[:, joint]).any()
                 if has_moved:
                     (log_amplitude,) = pushed.measure_amplitudes([joint])
-                    yield _DifferenceLine(name, path, log_amplitude, joint_styles[name])
+                    yield make_line(
+                        label=name, log_amplitude=log_amplitude, options=joint_styles[name]
+                    )
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -221,8 +239,7 @@ def _draw_differences(
     for line in lines:
         t_s, values = _trace_amplitude(line, growth.to_s, intervals_per_point)
         axes.plot(t_s, values, **line.options)
-        belongs_to_rated_push = line.path.push is rated.push
-        if belongs_to_rated_push:
+        if line.is_rated:
             rated_traces.append((t_s, values))
 
     # A push has one line, or one per joint. All of them belong to one twin, and therefore have
@@ -251,21 +268,20 @@ def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Arr
         Times in s and amplitudes in rad/s, each of shape (K,). An amplitude is NaN, which
         interrupts the line, at the end of each leg and where the difference is 0.
     """
-    path = line.path
     log_amplitude = line.log_amplitude
-    end = int(np.searchsorted(path.t_s, to_s))
-    end = max(end, path.pushed[-1] + 1)  # the last leg has at least one interval
+    end = int(np.searchsorted(line.t_s, to_s))
+    end = max(end, line.leg_starts[-1] + 1)  # the last leg has at least one interval
     t_s = np.zeros(0)
     log_peaks = np.zeros(0)
-    for leg_start, leg_end in pairwise([*path.pushed, end]):
+    for leg_start, leg_end in pairwise([*line.leg_starts, end]):
         # Each point of the line covers `step` intervals, and is drawn in the middle of them.
         starts = np.arange(leg_start, leg_end, step)
         middles = np.minimum(starts + step // 2, leg_end - 1)
         group_peaks = np.maximum.reduceat(log_amplitude[:leg_end], starts)
-        t_s = np.r_[t_s, path.t_s[middles], np.nan]
+        t_s = np.r_[t_s, line.t_s[middles], np.nan]
         log_peaks = np.r_[log_peaks, group_peaks, -np.inf]
     # Larger logarithms would overflow.
-    amplitudes = np.exp(np.minimum(log_peaks, MOST_LOG))
+    amplitudes = np.exp(np.minimum(log_peaks, _MOST_LOG))
     return t_s, np.where(np.isfinite(log_peaks), amplitudes, np.nan)
 
 
@@ -301,7 +317,7 @@ def _draw_rate(
     # The lowest line with this slope that stays 15 % above all values.
     log_offsets = np.log(1.15 * values[is_drawn]) - rated.rate_per_s * line_t_s
     log_offset = float(np.max(log_offsets))
-    line = np.exp(np.minimum(log_offset + rated.rate_per_s * line_t_s, MOST_LOG))
+    line = np.exp(np.minimum(log_offset + rated.rate_per_s * line_t_s, _MOST_LOG))
     options = {**style.LIMIT_LINE, "linewidth": 1.0, "zorder": 4.0}
     axes.plot(line_t_s, line, **options)
 
@@ -359,17 +375,19 @@ def _mark_push(axes: Axes, at_s: float, form: FigureSize) -> None:
     )
 
 
-def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
+def _draw_speeds(axes: Axes, pushed: PushedTwins, from_s: float) -> None:
     """Draws the speed of the fastest joint of every arm, in rad/s.
 
     The time axis is the same as that of the differences in the panel above.
 
     Args:
         axes: Panel of the figure, as Matplotlib axes.
-        log: Log of the run.
-        twins: Twins of the run, which also contain the speeds of the run.
+        pushed: A run and its pushed twins, which also contain the speeds of the run.
         from_s: Start of the time axis, in s.
     """
+    log = pushed.log
+    twins = pushed.growth.twins
+    assert twins is not None
     t_s = twins.paths[0].t_s
     first = 0
     for site in log.sites:

@@ -9,7 +9,6 @@ from trilat_net.analysis.certificate.running_energy import RunningEnergy
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.membership import liveliness_token
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
@@ -81,8 +80,8 @@ def test_sessions_end_when_all_sites_have_left() -> None:
     session = WatchedSession()
     site = session.join()
     recorder = session.join()
-    site.announce(liveliness_token("t", "s", BOOT))
-    recorder.announce(liveliness_token("t", topics.RECORDER, BOOT))
+    site.announce(topics.presence_token("t", "s", BOOT))
+    recorder.announce(topics.presence_token("t", topics.RECORDER, BOOT))
     session.wait(2.0 * AWAY_NS / NS_PER_S)
     session.view.poll()
     site.close()
@@ -97,7 +96,7 @@ def test_sites_that_come_back_have_not_left() -> None:
     session = WatchedSession()
     for _ in range(2):
         site = session.join()
-        site.announce(liveliness_token("t", "s", BOOT))
+        site.announce(topics.presence_token("t", "s", BOOT))
         session.view.poll()
         site.close()
         session.wait(0.6 * AWAY_NS / NS_PER_S)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from trilat_net.core import POSITION, Array
-from trilat_net.log import QUATERNION_AXES, QuaternionSigns
+from trilat_net.log import QuaternionSigns
 
 
 class BodyTurns:
@@ -34,7 +34,7 @@ class BodyTurns:
         Returns:
             The same values, with the signs of some quaternions flipped, shape (7 b,).
         """
-        pose_length = POSITION + len(QUATERNION_AXES)
+        pose_length = POSITION + 4  # a quaternion has four numbers
         numbers = np.array(bodies, dtype=np.float64)
         poses = numbers.reshape(-1, pose_length)
         for body, pose in enumerate(poses):

@@ -20,7 +20,7 @@ Invariant:
 import hmac
 import secrets
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
@@ -30,13 +30,14 @@ from urllib.parse import parse_qs
 import msgspec
 from msgspec import Meta
 
-from trilat_net.errors import WireError
+from trilat_net.errors import SessionError, WireError
 from trilat_net.net import (
     Bus,
-    ChangeQuery,
+    ChangeReply,
     ChangeRequest,
     Clock,
     HandSender,
+    SessionMembers,
     topics,
 )
 
@@ -548,13 +549,11 @@ class OrderDesk:
     def __init__(
         self, bus: Bus, clock: Clock, session: str, refused: Counter[str] | None = None
     ) -> None:
-        self._bus = bus
-        self._clock = clock
-        self._session = session
+        self._members = SessionMembers(bus, clock, session)
         # Requests that wait to be sent, by site and subject.
         self._pending: dict[tuple[str, str], ChangeRequest] = {}
-        # Requests that wait for a reply, by site and channel.
-        self._open_queries: dict[tuple[str, str], ChangeQuery] = {}
+        # Functions that return the replies to open requests, by site and channel.
+        self._open_requests: dict[tuple[str, str], Callable[[], ChangeReply | None]] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
         if refused is None:
             refused = Counter()
@@ -635,7 +634,7 @@ class OrderDesk:
         for site in sites:
             # A pending release would let the arm move again right after the stop.
             self._pending.pop((site, RELEASE), None)
-            self._open_queries[site, topics.STOP] = self._send(site, request)
+            self._send_request(site, topics.STOP, request)
 
     def _release(self, order: _ReleaseArms, sites: Collection[str], source: str) -> None:
         """Queues requests to release stopped arms, or to reset arms after a fault.
@@ -670,9 +669,18 @@ class OrderDesk:
         if is_replacement or len(self._pending) < MAX_PENDING:
             self._pending[site, subject] = request
 
-    def _send(self, site: str, request: ChangeRequest) -> ChangeQuery:
-        """Sends a request to a site. The reply is received by `poll`."""
-        return ChangeQuery(self._bus, self._clock, self._session, site, request)
+    def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
+        """Sends a request to a site. The reply is received by `poll`.
+
+        For example, a request may change the delay of a link or stop an arm. Only one request
+        at a time waits for its reply.
+
+        Args:
+            site: Name of the site.
+            channel: Channel for changes or for stops.
+            request: The request.
+        """
+        self._open_requests[site, channel] = self._members.request_change(site, request)
 
     def mark(self, site: str, text: str) -> None:
         """Asks a site to publish an event that marks this moment in the log.
@@ -692,28 +700,26 @@ class OrderDesk:
         does not reply in time, an entry saying so is added to `replies`.
         """
         # A copy of the items, because answered requests are removed.
-        open_queries = list(self._open_queries.items())
-        for (site, channel), query in open_queries:
+        for (site, channel), poll_reply in list(self._open_requests.items()):
             try:
-                reply = query.poll()
+                reply = poll_reply()
+            except SessionError:
+                del self._open_requests[site, channel]
+                self.replies.append((site, channel, False, f"{site} does not answer"))
             except WireError as error:
-                del self._open_queries[site, channel]
+                del self._open_requests[site, channel]
                 self.refused[error.reason] += 1
-                continue
-            if reply is not None:
-                del self._open_queries[site, channel]
-                self.replies.append((site, channel, reply.accepted, reply.text))
-            elif query.is_overdue:
-                del self._open_queries[site, channel]
-                problem = f"{site} does not answer"
-                self.replies.append((site, channel, False, problem))
+            else:
+                if reply is not None:
+                    del self._open_requests[site, channel]
+                    self.replies.append((site, channel, reply.accepted, reply.text))
 
         pending = list(self._pending.items())
         for (site, subject), request in pending:
-            waits_for_reply = (site, topics.SET) in self._open_queries
+            waits_for_reply = (site, topics.SET) in self._open_requests
             if not waits_for_reply:
                 del self._pending[site, subject]
-                self._open_queries[site, topics.SET] = self._send(site, request)
+                self._send_request(site, topics.SET, request)
 
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:

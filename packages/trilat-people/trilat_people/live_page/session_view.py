@@ -37,7 +37,6 @@ from trilat_net.net import (
     LinkStats,
     SessionMembers,
     State,
-    decode,
     topics,
 )
 from trilat_net.records import NS_PER_S
@@ -505,7 +504,7 @@ class SessionView:
                 # Messages of an unknown boot (start of the process) cannot be read. A site that
                 # has been started again announces its new boot with an event.
                 may_announce_boot = channel == topics.EVENT
-                if not may_announce_boot or not self._accept_new_boot(parts.member, payload):
+                if not may_announce_boot or not self._accept_new_boot(site, payload):
                     raise
                 # From now on, messages of the new boot can be read.
                 message = site.repair.reception.read(channel, payload)
@@ -520,30 +519,20 @@ class SessionView:
             if is_new:
                 self._store(parts.member, site, channel, message.content)
 
-    def _accept_new_boot(self, name: str, payload: bytes) -> bool:
-        """Switches to a restarted site, if an event announces the restart.
-
-        Each start of a site is identified by a random number, its boot. Messages with an
-        unknown boot are dropped until an event announces that the new process has joined the
-        session.
+    def _accept_new_boot(self, site: SiteView, payload: bytes) -> bool:
+        """Switches to a restarted site, if an event announces that it has joined the session.
 
         Args:
-            name: Name of the site.
+            site: View of the site.
             payload: The event.
 
         Returns:
             True if the event belongs to a restarted site that may join.
         """
-        event = decode(payload, Event)
-        site = self.sites[name]
-        is_join = event.kind == "join" and event.member == name
-        names_own_boot = event.boots.get(name) == event.boot
-        if not is_join or not names_own_boot:
+        boot = site.repair.reception.find_new_boot(payload, ("join",))
+        if boot is None:
             return False
-        if self.scenario is None or not self.scenario.sites_may_return:
-            return False
-
-        site.repair = site.repair.follow_start(event.boot)
+        site.repair = site.repair.follow_start(boot)
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:

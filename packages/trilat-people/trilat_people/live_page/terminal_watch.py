@@ -16,7 +16,7 @@ from rich.console import Console
 from trilat_net.app import SessionDisplay, StatusRow
 from trilat_net.core import LifeAlarm
 from trilat_net.errors import SessionError
-from trilat_net.net import Bus, Clock, Connection, connect_to_session
+from trilat_net.net import Bus, Clock, Connection
 from trilat_net.presentation import describe_energy_obstacle
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import parse_embedded
@@ -67,8 +67,7 @@ def watch_session(
     """
     with Interrupt() as interrupt:
         stopped = interrupt.is_requested
-        connection_to_session = connect_to_session(
-            connection,
+        connection_to_session = connection.open_session(
             clock,
             session,
             lambda text: parse_embedded(text, session).names,

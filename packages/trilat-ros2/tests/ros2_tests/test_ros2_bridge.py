@@ -59,7 +59,7 @@ from trilat_net.log.ros2.topic_names import (
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient
 from trilat_net.net.clock import SystemClock
-from trilat_net.net.membership import describe_member, liveliness_token
+from trilat_net.net.membership import describe_member
 from trilat_net.net.messages import Event
 from trilat_net.net.requests import ArmMeasurement, Backfill
 from trilat_net.net.ros2.ros2_graph import Attachment, QualityOfService, Refusals
@@ -700,7 +700,7 @@ class Sites:
             "made": len(noted),
         }
         for site in self._scenario.names:
-            bus.announce(liveliness_token(session, site, 1))
+            bus.announce(topics.presence_token(session, site, 1))
             bus.respond(topics.key(session, site, topics.INFO), lambda _: self._info)
             kept = encode(Backfill(member=site, boot=1, **past))
             bus.respond(topics.key(session, site, topics.PAST), lambda _, kept=kept: kept)

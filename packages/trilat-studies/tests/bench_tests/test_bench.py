@@ -53,7 +53,7 @@ from trilat_studies.bench.bench_run import (
     JudgedRun,
     find_least_energy,
 )
-from trilat_studies.measure_run import RecordBatch
+from trilat_studies.record_batches import RecordBatch
 from trilat_studies.tuning import plan_tuning
 from trilat_studies.tuning.candidate import CandidateClass, CandidateScore, TuningScenario
 from trilat_studies.tuning.search_space import SEARCH_SPACES

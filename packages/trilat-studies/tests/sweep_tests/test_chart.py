@@ -10,12 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import make_map_rows
 from trilat_studies.run_commands import format_override_value
-from trilat_studies.sweep.stability_map import (
-    MapLine,
-    PlaneAxis,
-    StabilityCriterion,
-    StabilityMap,
-)
+from trilat_studies.sweep.map_plane import PlaneAxis
+from trilat_studies.sweep.stability_criteria import StabilityCriterion
+from trilat_studies.sweep.stability_map import MapLine, StabilityMap
 from trilat_studies.sweep.sweep_plan import plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults
 

@@ -18,7 +18,8 @@ from study_builders import (
 )
 from trilat_studies.sweep import prepare_sweep_folder
 from trilat_studies.sweep.map_page import MapReport
-from trilat_studies.sweep.stability_map import MapPlane, StabilityMap
+from trilat_studies.sweep.map_plane import MapPlane
+from trilat_studies.sweep.stability_map import StabilityMap
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 from trilat_studies.sweep.sweep_results import SweepResults, read_results
 

@@ -8,7 +8,7 @@ from trilat_studies.side_by_side import describe_runs_alone
 from trilat_studies.sweep import plan_sweep, sweep_run
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 
-from trilat_net.core.lanes import run_groups
+from trilat_net.core.lanes.lane_structure import RunStructure
 from trilat_net.execution.fused import FusedRun
 
 
@@ -24,7 +24,7 @@ def run_in(folder: Path) -> sweep_run.FinishedSweep:
 
 
 def find_slow_site(run: FusedRun) -> str:
-    """Stands for `find_obstacle`: runs with a slow site cannot be computed in lanes."""
+    """Stands for `RunStructure.find_obstacle`: lanes do not support a slow site."""
     return "a slow site" if run.scenario.sites["s"].rate_hz == 500 else ""
 
 
@@ -38,7 +38,7 @@ def test_table_does_not_depend_on_lanes(
     assert describe_runs_alone(alone.alone, alone.runs) == ""
 
     monkeypatch.setattr(sweep_run, "LANE_SITE_TICKS", 0)
-    monkeypatch.setattr(run_groups, "find_obstacle", find_slow_site)
+    monkeypatch.setattr(RunStructure, "find_obstacle", find_slow_site)
     together = run_in(tmp_path / "together")
     assert lane_times_s
     assert together.runs == alone.runs == len(together.results.rows)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import replace_judge
 from trilat_studies.sweep import margin_search
+from trilat_studies.sweep.map_plane import StabilityEdge
 from trilat_studies.sweep.margin_search import (
     SCAN_POINTS,
     GridPointMargin,
@@ -15,7 +16,6 @@ from trilat_studies.sweep.margin_search import (
     SearchRange,
     SweepMargins,
 )
-from trilat_studies.sweep.stability_map import StabilityEdge
 from trilat_studies.sweep.sweep_cell import CellClass, CellResult
 from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
 

@@ -23,7 +23,8 @@ from trilat_studies.sweep.map_page import (
     CLASS_COLOURS,
     MapReport,
 )
-from trilat_studies.sweep.stability_map import CELL_CLASSES, MapLine, MapPlane, StabilityMap
+from trilat_studies.sweep.map_plane import CELL_CLASSES, MapPlane
+from trilat_studies.sweep.stability_map import MapLine, StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass
 from trilat_studies.sweep.sweep_plan import plan_sweep
 

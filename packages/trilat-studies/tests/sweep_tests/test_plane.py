@@ -15,7 +15,7 @@ from study_builders import (
     make_map_plane,
     make_map_rows,
 )
-from trilat_studies.sweep.stability_map import CELL_CLASSES, MapPlane, PlaneAxis, StabilityEdge
+from trilat_studies.sweep.map_plane import CELL_CLASSES, MapPlane, PlaneAxis, StabilityEdge
 from trilat_studies.sweep.sweep_axis import label_axis, label_setting
 from trilat_studies.sweep.sweep_cell import CellClass
 

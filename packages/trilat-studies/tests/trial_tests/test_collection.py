@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from trilat_studies.measure_run import (
+from trilat_studies.expectations import ExpectationResult
+from trilat_studies.measure_run import RunMetrics
+from trilat_studies.record_batches import (
     BATCH_RECORDS,
+    BatchedRun,
     RecordBatch,
-    RunMetrics,
-    SiteStats,
-    WindowStats,
-    run_compiled_in_batches,
     run_in_batches,
 )
+from trilat_studies.run_statistics import SiteStats, WindowStats
 
 import trilat_net
 from tests.log.builders import drop_records, edit_log_bytes, make_log_bytes, open_bytes
@@ -420,10 +420,9 @@ def test_compiled_loop_gives_records_of_the_ticks(changes: dict[str, Any]) -> No
     diverged_at_s, _ = run_in_batches(
         scenario, {name: batches.append for name, batches in by_tick.items()}
     )
-    run = run_compiled_in_batches(
-        scenario, {name: batches.append for name, batches in compiled.items()}
-    )
-    assert run.diverged_s == diverged_at_s
+    batched = BatchedRun(scenario, {name: batches.append for name, batches in compiled.items()})
+    batched.finish()
+    assert batched.run.diverged_s == diverged_at_s
     for name in scenario.names:
         records = RecordBatch.join(compiled[name])
         expected = RecordBatch.join(by_tick[name])
@@ -445,7 +444,9 @@ def test_any_metric_may_be_expected() -> None:
     run = RunMetrics.of_virtual_run(scenario)
     assert run.metrics == RunMetrics.of_log(log).metrics
 
-    outcomes = {outcome.key: outcome for outcome in run.compare_with(scenario.expect)}
+    outcomes = {
+        outcome.key: outcome for outcome in ExpectationResult.list_of_run(run, scenario.expect)
+    }
     assert [outcomes[f"metrics.{key}"].held for key in expectations] == [False, True, False]
     assert outcomes["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
     assert "nothing is learnt" in outcomes["metrics.theta_error_last"].measured

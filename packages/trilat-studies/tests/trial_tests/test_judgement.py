@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import CALM, make_run_metrics
-from trilat_studies.measure_run import ExpectationResult, Range, RunMetrics
+from trilat_studies.expectations import ExpectationResult
+from trilat_studies.measure_run import RunMetrics
+from trilat_studies.run_statistics import Range
 
 from trilat_net.analysis.run_end import EndBehaviour, EndDoubt, Stability
 from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
@@ -35,7 +37,7 @@ TOLERANCES = {"synchronised_rad", "end_pose_within_rad"}
 
 def evaluate_single(expect: Expect, **changes: Any) -> ExpectationResult:
     """Returns the single outcome for the calm run with some metrics replaced."""
-    outcomes = make_run_metrics(**changes).compare_with(expect)
+    outcomes = ExpectationResult.list_of_run(make_run_metrics(**changes), expect)
     assert len(outcomes) == 1
     return outcomes[0]
 
@@ -45,7 +47,7 @@ def test_every_asked_key_is_answered_and_no_other() -> None:
     assert READINGS.keys() | OTHERS.keys() | TOLERANCES | tables == set(
         Expect.__struct_fields__
     )
-    assert CALM.compare_with(Expect()) == []
+    assert ExpectationResult.list_of_run(CALM, Expect()) == []
     for key, value in {**READINGS, **OTHERS}.items():
         assert evaluate_single(Expect(**{key: value})).key.split(".")[0] == key
 
@@ -133,7 +135,9 @@ def test_pose_must_match_each_joint_within_tolerance(off: float, within: float) 
 
 
 def test_sites_with_poses_have_outcomes_of_their_own() -> None:
-    outcomes = CALM.compare_with(Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)}))
+    outcomes = ExpectationResult.list_of_run(
+        CALM, Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)})
+    )
     assert [(o.key, o.held) for o in outcomes] == [
         ("end_pose_rad.m1", True),
         ("end_pose_rad.s", False),
@@ -144,7 +148,7 @@ def test_sites_with_poses_have_outcomes_of_their_own() -> None:
 def test_gaps_are_counted() -> None:
     assert not evaluate_single(Expect(no_gaps=True)).held
     assert evaluate_single(Expect(no_gaps=True), missing=0).held
-    assert CALM.compare_with(Expect(no_gaps=False)) == []
+    assert ExpectationResult.list_of_run(CALM, Expect(no_gaps=False)) == []
 
 
 SPANS = {
@@ -183,7 +187,9 @@ def test_a_window_names_units_and_all_sites() -> None:
     window = ExpectWindow(
         from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0)
     )
-    outcomes = make_run_metrics(windows=(SPANS,)).compare_with(Expect(windows=(window,)))
+    outcomes = ExpectationResult.list_of_run(
+        make_run_metrics(windows=(SPANS,)), Expect(windows=(window,))
+    )
     assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
     assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]
 
@@ -218,7 +224,9 @@ def meets_stable(three: bool, d: float, stable: bool, **link: object) -> bool:
     scenario: Scenario = (
         load_scenario("free", changes) if three else parse_scenario(TWO, "two", changes)
     )
-    (outcome,) = RunMetrics.of_virtual_run(scenario).compare_with(scenario.expect)
+    (outcome,) = ExpectationResult.list_of_run(
+        RunMetrics.of_virtual_run(scenario), scenario.expect
+    )
     return outcome.held
 
 

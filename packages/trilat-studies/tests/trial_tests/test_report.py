@@ -7,7 +7,7 @@ import xml.etree.ElementTree as Xml
 from hypothesis import given
 from hypothesis import strategies as st
 from study_builders import make_trial_result
-from trilat_studies.measure_run import ExpectationResult
+from trilat_studies.expectations import ExpectationResult
 from trilat_studies.trials import MAX_FAILURES_SHOWN, TrialReport
 
 

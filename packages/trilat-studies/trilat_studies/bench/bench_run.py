@@ -56,7 +56,8 @@ from trilat_net.work import (
     Workers,
 )
 
-from ..measure_run import RecordBatch, WholeRun, describe_program
+from ..measure_run import describe_program
+from ..record_batches import RecordBatch, WholeRun
 from ..side_by_side import RunKind, prepare_kinds
 from ..study_folder import StudyFolder
 from ..tuning.candidate import TuningScenario

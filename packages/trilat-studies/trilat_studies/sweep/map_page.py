@@ -44,15 +44,8 @@ from trilat_net.files import write_whole
 from trilat_net.presentation import COLUMN_IN, FigureSize, TextTable, style
 
 from .fixed_gains import FAIR_COMPARISON
-from .stability_map import (
-    CELL_CLASSES,
-    MapLine,
-    MapPanel,
-    MapPlane,
-    PlaneAxis,
-    StabilityEdge,
-    StabilityMap,
-)
+from .map_plane import CELL_CLASSES, MapPanel, MapPlane, PlaneAxis, StabilityEdge
+from .stability_map import MapLine, StabilityMap
 from .sweep_cell import CellClass
 
 CLASS_COLOURS = {

@@ -32,7 +32,8 @@ from trilat_net.work import Progress, WorkerPool, Workers
 from ..run_commands import format_override_value
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
-from .stability_map import StabilityCriterion, StabilityEdge
+from .map_plane import StabilityEdge
+from .stability_criteria import StabilityCriterion
 from .sweep_axis import label_axis
 from .sweep_plan import SweepCell, SweepPlan
 

@@ -62,7 +62,7 @@ from trilat_net.scenario import (
 )
 from trilat_net.work import MeanInterval
 
-from ..measure_run import RecordBatch, WholeRun
+from ..record_batches import RecordBatch, WholeRun
 from ..run_commands import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 

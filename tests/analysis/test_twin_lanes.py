@@ -8,12 +8,12 @@ import pytest
 
 import trilat_net as tn
 from tests.execution.circling_hand import CirclingHand
-from trilat_net.core.lanes import twin_lanes
-from trilat_net.execution import twins as twins_module
-from trilat_net.execution.twins import (
+from trilat_net.analysis.twins import twin_runs
+from trilat_net.analysis.twins.twin_runs import (
     Push,
     Twins,
 )
+from trilat_net.core.lanes import twin_lanes
 from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -23,7 +23,7 @@ Runner = Callable[[], Twins]
 
 def check_both_ways(monkeypatch: pytest.MonkeyPatch, run: Runner) -> Twins:
     """Runs twins in lanes and one by one, checks that they are equal, and returns them."""
-    monkeypatch.setattr(twins_module, "LANE_SITE_TICKS", 0)
+    monkeypatch.setattr(twin_runs, "LANE_SITE_TICKS", 0)
     calls = []
     step_to = twin_lanes.TwinLanes.step_to
 

@@ -1,9 +1,11 @@
-"""Reads the files of a session's log, and merges them into one log.
+"""Reads everything in a log into memory, and merges the files of a session into one log.
 
 A log has several files (parts) if the recorder split it, or if several recorders recorded the
 session, one after another or simultaneously.
 
 Invariant:
+    - The messages of a log stay encoded until they are needed.
+    - Channels written for viewers (/viz) are skipped.
     - A message that occurs in several parts is written once.
     - Parts of different sessions are rejected, and so are parts that contain different messages
       with the same number.
@@ -12,61 +14,307 @@ Invariant:
 
 import hashlib
 import os
+from array import array
 from bisect import bisect_right
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..errors import LogError, WireError
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import LogError, ScenarioError, WireError
 from ..files import open_regular
 from ..net import READABLE, Event, LinkStats, RecorderStats, decode, topics
-from .log_layout import ACCOUNTS, PART, describe_unfinished
-from .mcap_reader import ChannelMessages, LogContents, Progress, shift_progress
+from ..scenario import parse_embedded
+from .log_layout import ACCOUNTS, CHANNEL_TYPES, PART, SCENARIO, SESSION, describe_unfinished
+from .mcap_reader import McapReader, MessageBlock, Progress, shift_progress
+from .packed.packed_messages import PADDING, PackedMessages
 from .record_columns import RecordColumns
-from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState
+from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState, Integrity
+
+_LAST_SIGNED_NS = np.uint64((1 << 63) - 1)
+"""Latest time stamp that fits into a signed 64-bit integer, in ns."""
 
 
-def read_session(
-    sources: Sequence[str | Path | BinaryIO], progress: Progress | None
-) -> LogContents:
-    """Reads the log of one session from a file, or from the files of all its parts.
+_FIRST_BYTES = 1 << 12
+"""Initial space for the messages of a topic, in bytes."""
+
+
+class ChannelMessages:
+    """All messages of one topic in a log, still encoded, in file order.
+
+    Attributes:
+        log_ns: Arrival time of each of the K messages at the recorder in Unix time, in ns.
+        publish_ns: Sending time stated by each message in Unix time, in ns.
+    """
+
+    def __init__(self) -> None:
+        self._data = np.zeros(_FIRST_BYTES, np.uint8)
+        self._size = 0
+        self._ends = array("q")
+        self.log_ns = array("Q")
+        self.publish_ns = array("Q")
+
+    def __len__(self) -> int:
+        return len(self._ends)
+
+    @property
+    def payloads(self) -> PackedMessages:
+        """The payloads of all K messages of the topic, as published.
+
+        Messages that are added to the topic later are not included.
+        """
+        data = self._reserve(PADDING)
+        ends = np.array(self._ends, np.int64)
+        starts = np.concatenate([np.zeros(1, np.int64), ends])[: len(ends)]
+        return PackedMessages(data[: self._size + PADDING], starts, ends)
+
+    def payload(self, number: int) -> bytes:
+        """Returns the payload of one message of the topic, as published.
+
+        Args:
+            number: Number of the message, counted from 0.
+        """
+        start = self._ends[number - 1] if number else 0
+        return self._data[start : self._ends[number]].tobytes()
+
+    def _reserve(self, size: int) -> NDArray[np.uint8]:
+        """Returns the array with the payloads of all messages, with space for more at its end.
+
+        The array at least doubles whenever it grows, which keeps many small additions cheap.
+
+        Args:
+            size: Number of additional bytes.
+        """
+        needed = self._size + size
+        if needed > len(self._data):
+            larger_array = np.empty(max(needed, 2 * len(self._data)), np.uint8)
+            larger_array[: self._size] = self._data[: self._size]
+            self._data = larger_array
+        return self._data
+
+    def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
+        """Appends a message to those of the topic.
+
+        Messages must be added in file order.
+
+        Args:
+            payload: The message, encoded as published.
+            log_ns: Arrival time at the recorder in Unix time, in ns.
+            publish_ns: Sending time in Unix time, in ns.
+        """
+        data = self._reserve(len(payload))
+        end = self._size + len(payload)
+        data[self._size : end] = np.frombuffer(payload, np.uint8)
+        self._size = end
+        self._ends.append(end)
+        self.log_ns.append(log_ns)
+        self.publish_ns.append(publish_ns)
+
+    def add_block(self, block: MessageBlock) -> None:
+        """Appends a block of messages to those of the topic. Blocks must come in file order."""
+        data = self._reserve(block.most_bytes)
+        ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
+        self._size = int(ends[-1])
+        # The bytes of the NumPy arrays are appended to compact arrays of integers.
+        self._ends.frombytes(ends.tobytes())
+        self.log_ns.frombytes(log_ns.tobytes())
+        self.publish_ns.frombytes(publish_ns.tobytes())
+
+    def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Returns the arrival and sending times of the topic's K messages as arrays, in ns.
+
+        Returns:
+            The arrival times and the sending times in Unix time, each of shape (K,). A time of
+            2^63 ns or later is replaced by the largest value that fits.
+        """
+        return _clip_times(self.log_ns), _clip_times(self.publish_ns)
+
+
+def _clip_times(times: "array[int]") -> NDArray[np.int64]:
+    """Converts unsigned times to signed times, clipping those that are too late."""
+    unsigned = np.array(times, dtype=np.uint64)
+    return np.minimum(unsigned, _LAST_SIGNED_NS).astype(np.int64)
+
+
+@dataclass
+class LogContents:
+    """Everything in a log, from one or several files, before its messages are decoded.
+
+    Attributes:
+        sources: Names of the files.
+        session: Metadata of the session, such as its name and its start time.
+        scenario: Encoded text of the scenario.
+        metadata: Maps the name of each metadata record to its contents.
+        channels: Maps each topic to its messages.
+        complete: True if all parts are present and finished, and can be read completely.
+        ended: True if the last part was finished.
+        damaged: One sentence for each part of a file that cannot be read.
+        chain: Whether the log matches its digests. For several files, the worst result.
+    """
+
+    sources: tuple[str, ...]
+    session: dict[str, str]
+    scenario: bytes
+    metadata: dict[str, dict[str, str]]
+    channels: dict[str, ChannelMessages] = field(repr=False)
+    complete: bool
+    ended: bool
+    damaged: list[str]
+    chain: Integrity
+
+    @property
+    def source(self) -> str:
+        """Name of the log for error messages, so that users know which file is meant."""
+        more = len(self.sources) - 1
+        if not more:
+            return self.sources[0]
+        return f"{self.sources[0]} and {more} more {'parts' if more > 1 else 'part'}"
+
+    @classmethod
+    def read(
+        cls,
+        stream: BinaryIO,
+        name: str,
+        progress: Progress | None = None,
+        *,
+        trusted: bool = False,
+    ) -> "LogContents":
+        """Reads everything in a log file into memory, without decoding the messages.
+
+        Args:
+            stream: The file, opened for reading.
+            name: Name of the file for error messages.
+            progress: Function that is called after every record of the file.
+            trusted: True if this program has just written the file. Memory for the messages is
+                then unlimited. The limit protects against files crafted to cause harm, but a
+                harmless file in which arms hardly move may exceed it, because it compresses so
+                well.
+
+        Raises:
+            LogError: The file is not an MCAP file, or not a log of trilat-net.
+        """
+        reader = McapReader(stream, name, progress, kept=not trusted)
+        channels: dict[str, ChannelMessages] = {}
+        for block in reader.blocks(_is_log_topic):
+            channel = channels.setdefault(block.topic, ChannelMessages())
+            channel.add_block(block)
+        _check_head(reader, name)
+
+        damaged = [f"{name}: {damage}" for damage in reader.damaged]
+        is_first_part = reader.metadata.get(PART, {}).get("index", "1") == "1"
+        return cls(
+            sources=(name,),
+            session=reader.metadata[SESSION],
+            scenario=reader.attachments[SCENARIO],
+            metadata=reader.metadata,
+            channels=channels,
+            complete=reader.complete and not damaged and is_first_part,
+            ended=reader.complete,
+            damaged=damaged,
+            chain=reader.judge_digest(),
+        )
+
+    @classmethod
+    def of_session(
+        cls, sources: Sequence[str | Path | BinaryIO], progress: Progress | None
+    ) -> "LogContents":
+        """Reads the log of one session from a file, or from the files of all its parts.
+
+        Args:
+            sources: Paths, or binary files opened for reading, in any order.
+            progress: Function that is called repeatedly with the number of bytes read and the
+                total over all files.
+
+        Returns:
+            The contents of all files, as if they were one file.
+
+        Raises:
+            LogError: A file cannot be read, or the files belong to different sessions or
+                contain different versions of a message.
+        """
+        return _merge_parts(_read_parts(sources, progress))
+
+    @classmethod
+    def of_sessions(
+        cls, files: Sequence[Path], progress: Progress | None
+    ) -> "list[LogContents]":
+        """Reads the logs of one or several sessions.
+
+        Args:
+            files: Paths of the files, in any order.
+            progress: Function that is called repeatedly with the number of bytes read and the
+                total over all files.
+
+        Returns:
+            The contents of each session. Files of the same session are merged.
+
+        Raises:
+            LogError: A file cannot be read, or files of a session contain different versions of
+                a message.
+        """
+        sessions: dict[str, list[LogContents]] = {}
+        for part in _read_parts(files, progress):
+            sessions.setdefault(str(_identify_session(part)), []).append(part)
+        return list(map(_merge_parts, sessions.values()))
+
+    @staticmethod
+    def check(stream: BinaryIO, name: str) -> None:
+        """Reads a log once, without storing its messages, to find out whether it can be opened.
+
+        A log of any length can be checked with little memory.
+
+        Args:
+            stream: The file, opened for reading.
+            name: Name of the file for error messages.
+
+        Raises:
+            LogError: The file cannot be opened as a log. The message states the reason.
+        """
+        reader = McapReader(stream, name)
+        # Reads all messages, but stores no message.
+        deque(reader.blocks(_is_log_topic), maxlen=0)
+        _check_head(reader, name)
+        try:
+            parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")
+        except (ScenarioError, UnicodeDecodeError) as error:
+            raise LogError(
+                f"{name}: the scenario in this log cannot be read: {error}"
+            ) from None
+
+
+def _is_log_topic(topic: str) -> bool:
+    """True if the messages of a topic belong to a log of this program."""
+    key = topics.parse_key(topic.removeprefix("/"))
+    return key is not None and key.channel in CHANNEL_TYPES
+
+
+def _check_head(reader: McapReader, name: str) -> None:
+    """Raises LogError unless an MCAP file is a log of trilat-net, which describes a session.
 
     Args:
-        sources: Paths, or binary files opened for reading, in any order.
-        progress: Function that is called repeatedly with the number of bytes read and the total
-            over all files.
-
-    Returns:
-        The contents of all files, as if they were one file.
+        reader: Reader that has read the complete file.
+        name: Name of the file for the error message.
 
     Raises:
-        LogError: A file cannot be read, or the files belong to different sessions or contain
-            different versions of a message.
+        LogError: The file lacks the metadata of the session, or the scenario.
     """
-    return _merge_parts(_read_parts(sources, progress))
-
-
-def read_sessions(files: Sequence[Path], progress: Progress | None) -> list[LogContents]:
-    """Reads the logs of one or several sessions.
-
-    Args:
-        files: Paths of the files, in any order.
-        progress: Function that is called repeatedly with the number of bytes read and the total
-            over all files.
-
-    Returns:
-        The contents of each session. Files of the same session are merged.
-
-    Raises:
-        LogError: A file cannot be read, or files of a session contain different versions of a
-            message.
-    """
-    sessions: dict[str, list[LogContents]] = {}
-    for part in _read_parts(files, progress):
-        sessions.setdefault(str(_identify_session(part)), []).append(part)
-    return list(map(_merge_parts, sessions.values()))
+    session = reader.metadata.get(SESSION, {})
+    missing_parts = [key for key in ("session", "driver") if key not in session]
+    if SCENARIO not in reader.attachments:
+        missing_parts.append(SCENARIO)
+    if missing_parts:
+        # The missing part may have been in a damaged part of the file.
+        reason = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
+        problem = (
+            f"{name}: is an MCAP file, but not a log of trilat-net: {missing_parts[0]} is "
+            "missing"
+        )
+        raise LogError(f"{problem}; {reason}" if reason else problem)
 
 
 def _read_parts(

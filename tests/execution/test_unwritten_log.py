@@ -8,7 +8,7 @@ import pytest
 
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.errors import LogError
-from trilat_net.execution import SimulatedLog, simulate_columns
+from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.log import UnwrittenLog
 from trilat_net.scenario import load_scenario
 
@@ -33,7 +33,7 @@ RUNS: list[tuple[str, dict[str, Any]]] = [
 def test_columns_equal_those_of_a_written_log(name: str, settings: dict[str, Any]) -> None:
     scenario = load_scenario(name, {"duration_s": 1.0, **settings})
     written = SimulatedLog(scenario)
-    unwritten = simulate_columns(scenario)
+    unwritten = FusedRun.simulate_log(scenario)
     assert isinstance(unwritten, UnwrittenLog)
     for site in written.sites:
         for column in COLUMNS:
@@ -48,7 +48,7 @@ def test_columns_equal_those_of_a_written_log(name: str, settings: dict[str, Any
 def test_its_certificate_is_that_of_a_written_log(name: str, settings: dict[str, Any]) -> None:
     scenario = load_scenario(name, {"duration_s": 1.0, **settings})
     written = Certificate.of_log(SimulatedLog(scenario)).to_dict()
-    unwritten = Certificate.of_log(simulate_columns(scenario)).to_dict()
+    unwritten = Certificate.of_log(FusedRun.simulate_log(scenario)).to_dict()
     assert json.dumps(unwritten) == json.dumps(written)
 
 
@@ -63,18 +63,18 @@ def test_its_certificate_is_that_of_a_written_log(name: str, settings: dict[str,
 )
 def test_runs_with_more_than_columns_are_written(settings: dict[str, Any]) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0, **settings})
-    assert isinstance(simulate_columns(scenario), SimulatedLog)
+    assert isinstance(FusedRun.simulate_log(scenario), SimulatedLog)
 
 
 @pytest.mark.parametrize("column", ["mem", "late_us", "sent_ns", "arrivals"])
 def test_a_column_not_kept_is_an_error(column: str) -> None:
-    log = simulate_columns(load_scenario("paper", {"duration_s": 0.1}))
+    log = FusedRun.simulate_log(load_scenario("paper", {"duration_s": 0.1}))
     with pytest.raises(LogError, match="s has no"):
         getattr(log["s"], column)
 
 
 def test_an_unwritten_log_names_its_length() -> None:
-    log = simulate_columns(load_scenario("paper", {"duration_s": 0.1}))
+    log = FusedRun.simulate_log(load_scenario("paper", {"duration_s": 0.1}))
     assert len(log["s"]) == 100
     assert log.missing("s") == 0
     assert log.complete

@@ -9,12 +9,12 @@ import pytest
 import trilat_net as tn
 from tests.certificate.adversaries import p_d, two_pairs
 from trilat_net.analysis.twins.twin_growth import TwinGrowth
-from trilat_net.errors import NotRepeatable, UsageError
-from trilat_net.execution.twins import (
+from trilat_net.analysis.twins.twin_runs import (
     LARGEST,
     Push,
     Twins,
 )
+from trilat_net.errors import NotRepeatable, UsageError
 from trilat_net.scenario import Scenario, load_scenario
 
 GOLDEN = Path(__file__).parents[1] / "golden"

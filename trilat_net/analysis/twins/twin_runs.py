@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core import BUCKETS_PER_S, Array, RunInputs
-from ..errors import NotRepeatable, UsageError, count_nouns
-from ..log import Ints, Log
-from ..records import NS_PER_S
-from ..scenario import Scenario
-from .fused import FusedRun
+from ...core import BUCKETS_PER_S, Array, RunInputs
+from ...errors import NotRepeatable, UsageError, count_nouns
+from ...execution import FusedRun
+from ...log import Ints, Log
+from ...records import NS_PER_S
+from ...scenario import Scenario
 
 MAX_PUSHES = 32
 """Maximum number of pushes that are chosen if the user states no number."""
@@ -384,7 +384,7 @@ def _run_twins(
         log: Log of the recorded run, with which the repeated run is compared.
     """
     # Imported here, so that programs that need no twins do not load this code.
-    from ..core import TwinLanes
+    from ...core import TwinLanes
 
     run = FusedRun(scenario, inputs=inputs)
     has_changes = inputs is not None and bool(inputs.changes)
@@ -731,7 +731,7 @@ class _LaneTwinRuns(_TwinRuns):
         record_count: int,
     ) -> list[Any]:
         """Creates the run and its twins (displaced copies), each in one lane of the vectors."""
-        from ..core import TwinLanes
+        from ...core import TwinLanes
 
         run = FusedRun(scenario, inputs=inputs)
         count = 1 + len(self._pushes)
