@@ -56,9 +56,9 @@ def test_figures_refused_by_disk_leave_no_file(form: str, tmp_path: Path) -> Non
         cwd=tmp_path,
     )
     assert done.returncode == 5
-    assert done.stderr.splitlines() == [
-        f"error: f/positions.{form} cannot be written: File too large"
-    ]
+    *progress, error = done.stderr.splitlines()
+    assert error == f"error: f/positions.{form} cannot be written: File too large"
+    assert set(progress) <= {"drawing ..."}  # on a busy machine
     assert list((tmp_path / "f").iterdir()) == []
 
 
