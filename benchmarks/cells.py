@@ -7,7 +7,7 @@ from trilat_studies.sweep.sweep_cell import classify_cell, classify_cells
 from trilat_studies.sweep.sweep_plan import plan_sweep
 
 import trilat_net as tn
-from trilat_net.analysis import SETTLED_ERROR_RAD, RunTrace, judge_virtual_run
+from trilat_net.analysis import SETTLED_ERROR_RAD, VirtualRun
 from trilat_net.core.lanes.run_groups import RunGroup
 from trilat_net.execution.fused import FusedRun
 
@@ -40,10 +40,12 @@ def run() -> list[str]:
             group.advance_to(DURATION_S)
         times_s.setdefault("simulation", []).append(time.process_time() - begun)
         begun = time.process_time()
-        for scenario, finished in zip(scenarios, runs, strict=True):
-            end = RunTrace(finished.buckets, finished.tau_x, finished.diverged_s)
-            judge_virtual_run(scenario, finished, end.classify_end(scenario))
+        decisions = [
+            VirtualRun(scenario, finished).decision
+            for scenario, finished in zip(scenarios, runs, strict=True)
+        ]
         times_s.setdefault("judgement", []).append(time.process_time() - begun)
+        assert len(decisions) == CELLS
     ms = {name: 1e3 * statistics.median(values) / CELLS for name, values in times_s.items()}
     return [
         f"{CELLS} cells of {DURATION_S:g} s of free, simulated and judged, processor time per cell:",

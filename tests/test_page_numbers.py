@@ -36,7 +36,7 @@ from tests.theory.figures_of_runs import find_value, measure_run
 from tests.theory.loops import RODS
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance
 from trilat_net.analysis.theory import (
-    analyse_linear_loop,
+    LinearAnalysis,
     find_equilibrium,
     iterate_linear_edges,
 )
@@ -80,7 +80,7 @@ Changes = dict[str, Any]
 def find_continuous_root(
     name: str, changes: Changes, pose: Pose | None = None
 ) -> tuple[float, float]:
-    analysis = analyse_linear_loop(
+    analysis = LinearAnalysis.compute(
         load_scenario(name, changes), pose=pose, roots=1
     ).continuous.rightmost
     assert analysis is not None
@@ -91,7 +91,7 @@ def find_root(
     name: str, changes: Changes | None = None, pose: Pose | None = None
 ) -> tuple[float, float]:
     """Returns the rightmost root that decides, the upper one of a pair."""
-    analysis = analyse_linear_loop(
+    analysis = LinearAnalysis.compute(
         load_scenario(name, changes or {}), pose=pose, roots=1
     ).decisive.rightmost
     assert analysis is not None
@@ -101,7 +101,7 @@ def find_root(
 def find_margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
     """Returns the largest common delay, ms, and the frequency there, rad/s."""
     high = (
-        analyse_linear_loop(load_scenario(name, changes or {}), roots=1)
+        LinearAnalysis.compute(load_scenario(name, changes or {}), roots=1)
         .margin.intervals[0]
         .high
     )

@@ -59,13 +59,13 @@ if _TYPE_CHECKING:
     from trilat_net.app.running_session import start as start
 
     from .analysis import info as info
-    from .analysis import twin as twin
     from .app.api import certify as certify
     from .app.api import export as export
     from .app.api import linear as linear
     from .app.api import metrics as metrics
     from .app.api import report as report
     from .app.api import simulate as simulate
+    from .app.api import twin as twin
     from .app.api import verify as verify
     from .app.api import view as view
     from .core import HandContext as HandContext
@@ -108,8 +108,8 @@ _NAMES = {
     "trilat_net.app.input_device": "Device DeviceState",
     "trilat_net.app.network_benchmark": "ping_benchmark",
     "trilat_net.app.running_session": "hand session start",
-    "trilat_net.app.api": "certify export linear metrics report simulate verify view",
-    "trilat_net.analysis": "info twin",
+    "trilat_net.app.api": "certify export linear metrics report simulate twin verify view",
+    "trilat_net.analysis": "info",
     "trilat_net.core": "HandContext HandView LawContext LawInput compiled",
     "trilat_net.execution": "rerun",
     "trilat_net.log": "check_file create_signing_keys expand_poses open_log recover sign_log",

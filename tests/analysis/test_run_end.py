@@ -276,7 +276,7 @@ def make_trace(speed: Array, *, one_way: bool = False) -> RunTrace:
     qd = np.tile((speed * (1.0 if one_way else np.cos(2.0 * np.pi * T_S)))[:, None], 2)
     q = np.cumsum(qd, axis=0) / RATE_HZ
     bucket = np.arange(len(T_S)) * BUCKETS_PER_S // RATE_HZ
-    buckets = RunTrace.reduce_records(bucket, np.zeros_like(q), qd, q, NO_BUCKETS)
+    buckets = RunEnd.reduce_records(bucket, np.zeros_like(q), qd, q, NO_BUCKETS)
     return RunTrace([buckets] * 3, [np.zeros(2)] * 3)
 
 

@@ -26,9 +26,8 @@ from tests.log.builders import (
     rewrite_log,
     write_log,
 )
-from trilat_net.analysis.file_overview import FileInventory, info, summarise_run
+from trilat_net.analysis.file_overview import info, summarise_run
 from trilat_net.errors import LogError
-from trilat_net.log.log_reader import open_log
 
 
 def parse_strictly(facts):
@@ -194,7 +193,7 @@ STATE = "/trilat/paper/m1/state"
 def test_gaps_count_missing_records(tmp_path: Path, lost: set[int]) -> None:
     """Records missing behind the last one do not count, because no number reveals them."""
     path = write_log(tmp_path, edit_log_bytes(WHOLE, record=drop_records("m1", lost)))
-    facts = FileInventory([path]).channels(open_log(path))[STATE]
+    facts = info(path).facts["channels"][STATE]
     last = max(set(range(120)) - lost)
     named = {n for first, end in facts["gaps"] for n in range(first, end + 1)}
     assert named == {n for n in lost if n < last}
@@ -208,11 +207,11 @@ def test_parts_are_counted_together(tmp_path: Path) -> None:
     for n, half in enumerate(halves):
         paths.append(tmp_path / f"{n}.mcap")
         paths[-1].write_bytes(edit_log_bytes(WHOLE, record=half))
-    inventory = FileInventory(paths)
-    facts = inventory.channels(open_log(*paths))[STATE]
+    overview = info(*paths)
+    facts = overview.facts["channels"][STATE]
     assert (facts["messages"], facts["missing"]) == (120, 0)
-    assert [file["finished"] for file in inventory.files] == [True, True]
-    assert info(*paths).facts["sites"]["m1"]["missing"] == 0
+    assert [file["finished"] for file in overview.facts["files"]] == [True, True]
+    assert overview.facts["sites"]["m1"]["missing"] == 0
 
 
 def test_progress_covers_the_file_once(tmp_path: Path) -> None:
@@ -226,7 +225,7 @@ def test_progress_covers_the_file_once(tmp_path: Path) -> None:
 
 def test_an_unreadable_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read"):
-        FileInventory([tmp_path])
+        info(tmp_path)
 
 
 def test_ticks_are_those_of_the_last_start() -> None:

@@ -5,9 +5,8 @@ import math
 import pytest
 
 from trilat_net.analysis.certificate.verdict_facts import UnsuppliedGrowth
-from trilat_net.analysis.decision_facts import LoopRoots, RunFindings, StabilityDecision
 from trilat_net.analysis.run_end import EndBehaviour, EndDoubt, RunEnd, Stability
-from trilat_net.analysis.stability_decision import decide_stability
+from trilat_net.analysis.stability_decision import LoopRoots, RunFindings, StabilityDecision
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, RestDeparture, TwinGrowth
 from trilat_net.analysis.twins.twin_runs import Push
@@ -45,7 +44,7 @@ GROWING = make_twin_growth(EnvelopeTrend.GROWS, 0.2)
 
 
 def decide(**findings: object) -> StabilityDecision:
-    return decide_stability(RunFindings(**{"end": make_run_end(), **findings}))  # type: ignore[arg-type]
+    return RunFindings(**{"end": make_run_end(), **findings}).decide()  # type: ignore[arg-type]
 
 
 def test_stable_needs_a_proof() -> None:

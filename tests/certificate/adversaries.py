@@ -31,7 +31,7 @@ from tests.certificate.drawn_loops import make_experiment, make_swinging_hand
 from tests.execution.builders import run_fused
 from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.premise_quantities import MissingFunctional
-from trilat_net.analysis.judge import judge_virtual_run
+from trilat_net.analysis.judge import VirtualRun
 from trilat_net.analysis.theory.equilibrium import extend_scenario, follow_equilibrium
 from trilat_net.analysis.theory.linear_edge import find_contact_growth, find_rightmost_root
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
@@ -785,7 +785,7 @@ def say_of_run(scenario: Scenario) -> str:
     if not MissingFunctional.list_of_scenario(scenario):
         return say_of(trilat_net.simulate(scenario))
     run = run_fused(scenario)
-    return str(judge_virtual_run(scenario, run).decision.stability)
+    return str(VirtualRun(scenario, run).decision.stability)
 
 
 def say_of_sweep(scenario: Scenario) -> str:

@@ -17,8 +17,8 @@ from tests.certificate.drawn_loops import draw_experiment
 from tests.cli.running import trilat
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import Stability
-from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
-from trilat_net.analysis.twins.twin_growth import TwinGrowth, twin
+from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
+from trilat_net.analysis.twins.twin_growth import PushedTwins, TwinGrowth
 from trilat_net.scenario import Scenario, load_scenario
 
 DRAWN_S = 10.0
@@ -111,7 +111,7 @@ def list_statements(scenario: Scenario) -> list[Statement]:
     )
     statements = [certified, swept, benched]
     if roots.verdict:
-        analysis = analyse_linear_loop(scenario)
+        analysis = LinearAnalysis.compute(scenario)
         root = analysis.decisive.rightmost
         linear = Statement(
             command="linear",
@@ -124,7 +124,7 @@ def list_statements(scenario: Scenario) -> list[Statement]:
         )
         statements.append(linear)
     if not twins.why:
-        growth = twin(log).growth
+        growth = PushedTwins.of_log(log).growth
         statements.append(Statement("twin", pushes=list_pushes(growth)))
     assert (
         cell.verdict.stable

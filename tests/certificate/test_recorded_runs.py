@@ -32,9 +32,9 @@ def count_recordings(
     monkeypatch.setattr(FusedRun, "simulate_log", count(FusedRun.simulate_log))
     scenario = load_scenario(name, settings)
     run = run_fused(scenario)
-    judgement = judge.judge_virtual_run(scenario, run)
+    decision = judge.VirtualRun(scenario, run).decision
     monkeypatch.undo()
-    return len(recorded), str(judgement.decision.stability)
+    return len(recorded), str(decision.stability)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import pytest
 import trilat_net as tn
 from tests.certificate.sampled_loops import make_constant_delay, make_sine_delay
 from tests.unit_arm import make_unit_scenario
-from trilat_net.analysis.certificate.observed_energy import ObservedFinding
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.twins.twin_runs import Push, Twins
@@ -74,7 +73,7 @@ def test_negative_energy_leaves_a_run_open_that_decays(
     assert find_least_known_j(log) < -1e-6
     certificate = tn.certify(log)
     assert certificate.observed is not None
-    assert certificate.observed.finding is ObservedFinding.NEGATIVE
+    assert certificate.observed.finding == "negative"
     assert certificate.stability is Stability.OPEN
     assert certificate.observed.text in certificate.reasons
     assert NEGATIVE_ENERGY_MEANING.startswith("an observed energy below zero")
@@ -86,7 +85,7 @@ def test_energy_within_the_reserve_proves_no_decay(delay_ms: float, K: float, B:
     assert find_least_known_j(log) >= 0.0
     certificate = tn.certify(log)
     assert certificate.observed is not None
-    assert certificate.observed.finding is ObservedFinding.PASSIVE
+    assert certificate.observed.finding == "passive"
     assert certificate.stability in (Stability.SETTLED, Stability.OPEN)
     assert certificate.decision.rests_on == "" or "pushes" in certificate.decision.rests_on
 

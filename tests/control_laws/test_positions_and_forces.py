@@ -25,7 +25,7 @@ from tests.unit_arm import (
     read_last_rows,
 )
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
-from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
+from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
 from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_weights
@@ -190,7 +190,7 @@ def test_full_acceleration_one_tick_late_is_unstable() -> None:
 
 
 def test_the_linear_loop_has_the_law_without_acceleration() -> None:
-    loop = analyse_linear_loop(three_sites(0.25, 5), pose=(0.0, 0.0)).loop
+    loop = LinearAnalysis.compute(three_sites(0.25, 5), pose=(0.0, 0.0)).loop
     A = loop.set_common_delay(0.0).A
     alpha = DominanceMatrix.complementary(0.25).alpha
     assert np.linalg.eigvals(A).real.max() == pytest.approx(

@@ -17,9 +17,9 @@ from tests.analysis.builders import (
 )
 from tests.log.builders import rewrite_log
 from trilat_net.analysis.certificate.stability_certificate import Certificate
-from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, TwinGrowth
 from trilat_net.analysis.twins.twin_runs import Push

@@ -174,7 +174,7 @@ def test_ages_after_an_outage_are_logarithmic():
 
 
 def test_shares_are_fractions_of_the_total():
-    axis = age_and_lateness.DelayAxis(np.array([0.0, 2.0, 9.0]), is_logarithmic=False)
+    axis = age_and_lateness.DelayAxis(np.array([0.0, 2.0, 9.0]))
     percent = axis.compute_percent(np.array([1.0, 2.0, 2.0, 4.0]))
     assert percent.tolist() == [0, 75, 100]
     assert np.isnan(axis.compute_percent(np.zeros(0))).all()

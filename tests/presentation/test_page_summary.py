@@ -19,12 +19,12 @@ from tests.log.builders import (
     write_log,
 )
 from trilat_net.analysis.certificate.stability_certificate import Certificate
-from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.metrics.log_metrics import LogMetrics
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, JointError
+from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import CheckReport, Finding
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_certificate

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from tests.analysis.builders import make_run
-from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.judge import certify_run
+from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.presentation.certificate_text import describe_certificate, describe_theorem
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilat_net.analysis.theory.linear_loop import DelayedTerm, LinearLoop
-from trilat_net.analysis.theory.port_response import find_site_ports
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -86,7 +85,7 @@ def hold_by_spring(loop: LinearLoop, site: str, K: float, B: float = 0.0) -> Lin
     """Returns the loop with a spring, N m/rad, and a damper, N m s/rad, to a fixed point at
     each joint of a site.
     """
-    ports = find_site_ports(loop, site)
+    ports = loop.find_site_ports(site)
     back = np.zeros((len(loop.inputs), len(loop.names)))
     back[ports] = B * loop.C[ports]
     back[

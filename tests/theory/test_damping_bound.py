@@ -11,7 +11,7 @@ from trilat_studies.sweep.stability_criteria import StabilityCriterion
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import compute_rod_inertia, count_growing, position_network
 from trilat_net.analysis.judge import list_law_proofs
-from trilat_net.analysis.theory import analyse_linear_loop
+from trilat_net.analysis.theory import LinearAnalysis
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.laws.conditions import (
@@ -86,7 +86,7 @@ def test_irreversible_shares_have_no_bound(
     scenario = position_network(alpha, d=d, delay_ms=delay_ms, masses=masses)
     assert d > 10.0 * delay_ms / 1e3 * abs(np.linalg.eigvals(alpha).real.min()) * (1.0 + 1e-9)
     assert StabilityCriterion.evaluate(scenario) is None
-    rightmost = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
+    rightmost = LinearAnalysis.compute(scenario, pose=POSE).decisive.rightmost
     assert rightmost is not None
     assert rightmost.s.real == pytest.approx(growth_per_s, abs=1e-3)
     assert (

@@ -15,8 +15,8 @@ from trilat_net.analysis.theory import find_equilibrium, floquet
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.floquet import (
     CoupledTicks,
+    SampledLoop,
     SamplesInUse,
-    compute_sampled_spectrum,
 )
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import Scenario, load_scenario
@@ -46,10 +46,9 @@ def make_loop_at_rest(
     scenario = load_scenario(
         scenario, starts | {f"sites.{site}.hands": [] for site in scenario.names}
     )
-    spectrum = compute_sampled_spectrum(
-        OperatingConditions.derive(scenario), find_equilibrium(scenario, pose), wanted
+    spectrum = SampledLoop(OperatingConditions.derive(scenario)).compute_spectrum(
+        find_equilibrium(scenario, pose), wanted
     )
-    assert spectrum is not None
     return Loop(scenario, spectrum)
 
 

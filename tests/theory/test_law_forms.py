@@ -24,10 +24,10 @@ from tests.transmission import (
 from tests.unit_arm import CLAMP, make_four_channel_pair, make_spring_hand, make_unit_scenario
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
-from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
+from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
-from trilat_net.analysis.theory.port_response import clamp_site, evaluate_transfer
+from trilat_net.analysis.theory.port_response import evaluate_transfer
 from trilat_net.core.links.dominance import DominanceMatrix
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
@@ -119,7 +119,7 @@ def test_wave_lines_feel_like_mass_and_spring() -> None:
     slow, fast = (2j * np.pi * hz for hz in (0.01, 0.1))
     assert abs(find_impedance(free, slow) / slow) == pytest.approx(4.0004, abs=5e-5)
     assert abs(find_impedance(free, fast)) == pytest.approx(2.538, abs=5e-4)
-    assert abs(find_impedance(clamp_site(free, "s"), fast)) == pytest.approx(51.88, abs=5e-3)
+    assert abs(find_impedance(free.clamp_site("s"), fast)) == pytest.approx(51.88, abs=5e-3)
 
 
 @pytest.mark.parametrize(("variant", "delay_s"), [key for key in TABLE if key[1] > 0.0])
@@ -281,7 +281,7 @@ def test_energy_switching_laws_explain_missing_roots() -> None:
 
 
 def test_the_analysis_of_waves_is_whole() -> None:
-    analysis = analyse_linear_loop(wave_pair(1000.0), pose=(0.0, 0.0))
+    analysis = LinearAnalysis.compute(wave_pair(1000.0), pose=(0.0, 0.0))
     assert analysis.verdict == "stable"
     assert analysis.sampled is None
     assert any("continuous time only" in note for note in analysis.notes)
@@ -307,7 +307,7 @@ def test_saturating_pulls_are_linearised_below_saturation() -> None:
         scenario = make_unit_scenario(
             {"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0}
         )
-        analysis = analyse_linear_loop(scenario, pose=(0.0, 0.0))
+        analysis = LinearAnalysis.compute(scenario, pose=(0.0, 0.0))
         loops.append([root.s for root in analysis.decisive.roots])
         assert any("small errors" in note for note in analysis.notes) == (
             law["law"] == "saturated_pd"

@@ -10,7 +10,6 @@ import math
 import pytest
 
 import trilat_net as tn
-from trilat_net.analysis.theory import analyse_linear_loop
 from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
 from trilat_net.analysis.theory.loop_roots import find_log_roots
 from trilat_net.errors import UsageError
@@ -28,13 +27,13 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 @pytest.fixture(scope="module")
 def calm() -> LinearAnalysis:
-    return analyse_linear_loop("p_d_margin", ["control.d=1.1"], pose=(0.07, 0.23))
+    return LinearAnalysis.compute("p_d_margin", ["control.d=1.1"], pose=(0.07, 0.23))
 
 
 @pytest.fixture(scope="module")
 def digital() -> LinearAnalysis:
     settings = ["scheme=digital", "rate_hz=100", "link.delay_ms=0"]
-    return analyse_linear_loop("paper", settings, pose=POSE)
+    return LinearAnalysis.compute("paper", settings, pose=POSE)
 
 
 def test_above_the_edge_a_margin_remains(calm: LinearAnalysis) -> None:
@@ -44,7 +43,7 @@ def test_above_the_edge_a_margin_remains(calm: LinearAnalysis) -> None:
 
 
 def test_less_damping_than_the_edge_is_unstable() -> None:
-    analysis = analyse_linear_loop("p_d_margin", ["control.d=0.9"], pose=(0.07, 0.23))
+    analysis = LinearAnalysis.compute("p_d_margin", ["control.d=0.9"], pose=(0.07, 0.23))
     assert analysis.verdict == "unstable"
     assert "\nunstable: the slowest motion goes as exp(0.01" in str(analysis)
 
@@ -94,7 +93,7 @@ def test_several_rates_have_roots_over_periods() -> None:
     settings = ["scheme=digital", "sites.m.rate_hz=40", "sites.s.rate_hz=30", "link.delay_ms=0"]
     control = {"control": {"law": "p_d", "K": 50.0, "d": 2.0}}
     pair = load_scenario(load_scenario("two_sites", control), settings)
-    analysis = analyse_linear_loop(pair, pose=(0.0, math.pi))
+    analysis = LinearAnalysis.compute(pair, pose=(0.0, math.pi))
     assert (analysis.continuous.verdict, analysis.verdict) == ("stable", "unstable")
     verdict = (
         "unstable: the slowest motion goes as exp(0.1802 t / s) at 9.955 rad/s, as computed over the period "
@@ -109,7 +108,7 @@ def test_several_rates_have_roots_over_periods() -> None:
 
 
 def test_drawn_delays_state_their_roots_accuracy() -> None:
-    analysis = analyse_linear_loop("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
+    analysis = LinearAnalysis.compute("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
     assert analysis.sampled is not None
     assert analysis.sampled.deviation_per_s is not None
     phrase = f"over 30 s of the delays in use, +- {analysis.sampled.deviation_per_s:.1g} /s"
@@ -121,7 +120,7 @@ def test_drawn_delays_state_their_roots_accuracy() -> None:
 def test_lasting_motions_are_separated_from_decaying() -> None:
     """Over wave lines with springs, the common speed of two joints lasts; the others decay."""
     control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
-    analysis = analyse_linear_loop(
+    analysis = LinearAnalysis.compute(
         "two_sites", {"scheme": "digital", "control": control}, pose=POSE
     )
     assert (
@@ -135,7 +134,7 @@ def test_a_line_without_losses_has_no_margin() -> None:
     """All of its roots are on the axis at any delay; a search for crossings among them would not end."""
     control = {"law": "wave", "b": 60.0, "K": 0.0}
     settings = {"scheme": "digital", "control": control}
-    analysis = analyse_linear_loop("two_sites", settings, pose=POSE, ports=True)
+    analysis = LinearAnalysis.compute("two_sites", settings, pose=POSE, ports=True)
     assert (analysis.verdict, analysis.margin.lossless, analysis.margin.crossings) == (
         "at the edge",
         True,
@@ -148,7 +147,7 @@ def test_a_line_without_losses_has_no_margin() -> None:
 @pytest.mark.parametrize("roots", [0, -1, 61])
 def test_invalid_numbers_of_roots_are_refused(roots: int) -> None:
     with pytest.raises(UsageError, match="roots must be from 1 to 60"):
-        analyse_linear_loop("free", roots=roots)
+        LinearAnalysis.compute("free", roots=roots)
 
 
 def test_several_rates_have_exact_scenario_roots() -> None:

@@ -16,7 +16,7 @@ from tests.theory.loops import Array, compute_residual, roots_within
 from trilat_net.analysis.theory import find_equilibrium, iterate_linear_edges
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.equilibrium import predict_equilibrium
-from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
+from trilat_net.analysis.theory.floquet import SampledLoop
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.analysis.theory.port_analysis import PortAnalysis, linearise_teleoperator
@@ -201,8 +201,7 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     edge = spectrum.roots[2].s.real - 0.05
     right = sum(2 if root.s.imag else 1 for root in spectrum.roots)
     assert roots_within(loop, complex(edge, -60.0), complex(20.0, 60.0)) == right + 6
-    sampled = compute_sampled_spectrum(case.conditions, case.rest, 3)
-    assert sampled is not None
+    sampled = SampledLoop(case.conditions).compute_spectrum(case.rest, 3)
     assert (sampled.zeros, sampled.drifting) == (spectrum.zeros, 0)
     for sampled_root, other in zip(sampled.roots, spectrum.roots, strict=True):
         assert abs(sampled_root.s - other.s) <= 2e-3 * abs(other.s)
@@ -253,8 +252,7 @@ def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
         "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist(),
     }
     case = make_six_joint_loop(law, rate_hz=200, **pushed)
-    spectrum = compute_sampled_spectrum(case.conditions, case.rest, 2)
-    assert spectrum is not None
+    spectrum = SampledLoop(case.conditions).compute_spectrum(case.rest, 2)
     root, following = (root_found.s for root_found in spectrum.roots)
     from_s = 6.0 / (root.real - following.real)  # by then the next mode has a part in 400 left
     motion_of_run = trace_angles(case.scenario, round(200 * (from_s + 2.0)))

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from tests.theory.loops import Array
 from trilat_net.analysis.theory import (
-    analyse_linear_loop,
+    LinearAnalysis,
     find_equilibrium,
     iterate_linear_edges,
 )
@@ -179,7 +179,7 @@ def test_the_real_part_is_that_of_the_analysis() -> None:
     )
     assert remarks == []
     for d, growth in zip(D, growth_rates, strict=True):
-        root = analyse_linear_loop(
+        root = LinearAnalysis.compute(
             make_damped_scenario(d), pose=(1.0 / 15.0, 7.0 / 30.0)
         ).continuous.rightmost
         assert root is not None

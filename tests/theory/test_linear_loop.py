@@ -8,7 +8,7 @@ import pytest
 
 from tests.execution.builders import make_trajectories, run_fused
 from tests.theory.loops import RODS
-from trilat_net.analysis.theory import analyse_linear_loop, find_equilibrium
+from trilat_net.analysis.theory import LinearAnalysis, find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.equilibrium import follow_equilibrium
 from trilat_net.analysis.theory.linear_loop import LinearLoop
@@ -119,7 +119,7 @@ def test_a_run_decays_at_its_rightmost_root() -> None:
     run = make_trajectories(scenario).sites["m"]
     late = run.t_s > 60.0
     q1_rad, q2_rad = run.q[late].mean(axis=0)
-    root = analyse_linear_loop(scenario, pose=(q1_rad, q2_rad)).decisive.rightmost
+    root = LinearAnalysis.compute(scenario, pose=(q1_rad, q2_rad)).decisive.rightmost
     assert root is not None
     turns = np.flatnonzero(np.diff(np.sign(run.qd[late, 0])))
     t_s = run.t_s[late]

@@ -10,13 +10,13 @@ from tests.scenario.builders import planar_task_text, posed_task_text
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import (
-    analyse_linear_loop,
+    LinearAnalysis,
     find_equilibrium,
     iterate_linear_edges,
 )
 from trilat_net.analysis.theory.characteristic_roots import Spectrum, find_moving_part
 from trilat_net.analysis.theory.equilibrium import find_mean_pose
-from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
+from trilat_net.analysis.theory.floquet import SampledLoop
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.analysis.theory.port_analysis import PortAnalysis, linearise_teleoperator
@@ -101,7 +101,7 @@ def test_sliders_have_equal_joint_and_task_loops(law: str) -> None:
         conditions = OperatingConditions.derive(scenario)
         loop = LinearLoop.of_conditions(conditions, rest)
         spectrum = Spectrum.of_loop(loop, 12)
-        sampled = compute_sampled_spectrum(conditions, rest, 12)
+        sampled = SampledLoop(conditions).compute_spectrum(rest, 12)
         Y = build_admittance(linearise_teleoperator(conditions, rest))(
             np.array([0.1, 3.0, 40.0])
         )
@@ -221,8 +221,7 @@ def test_runs_decay_and_swing_at_their_roots(name: str) -> None:
     scenario, rest = make_settled_scenario(name)
     conditions = OperatingConditions.derive(scenario)
     near = Spectrum.of_loop(LinearLoop.of_conditions(conditions, rest), 14)
-    spectrum = compute_sampled_spectrum(conditions, rest, 14)
-    assert spectrum is not None
+    spectrum = SampledLoop(conditions).compute_spectrum(rest, 14)
     assert spectrum.verdict == near.verdict == "stable"
     swings = [root.s for root in spectrum.roots if root.s.imag > 0.7 * abs(root.s)][:3]
     assert swings
@@ -261,7 +260,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     law = {"law": "p_d", "K": 120.0, "d": 12.0}
     scenario = parse_scenario(planar_task_text(), "planar", {"control": law})
     pose = find_mean_pose(scenario)
-    analysis = analyse_linear_loop(scenario, pose=pose)
+    analysis = LinearAnalysis.compute(scenario, pose=pose)
     end = analysis.margin.intervals[0].high
     assert end is not None
     rightmost = Spectrum.of_loop(analysis.loop.set_common_delay(end.delay_s), 1).rightmost
@@ -273,7 +272,7 @@ def test_edges_margins_and_verdict_share_one_loop() -> None:
     assert edge is not None
     for d, verdict in ((0.99 * edge.value, "unstable"), (1.01 * edge.value, "stable")):
         beside = load_scenario(scenario, {"control.d": d})
-        assert analyse_linear_loop(beside, pose=pose, roots=1).continuous.verdict == verdict
+        assert LinearAnalysis.compute(beside, pose=pose, roots=1).continuous.verdict == verdict
 
 
 def test_poses_without_loop_are_refused_by_name() -> None:
@@ -291,5 +290,5 @@ def test_poses_without_loop_are_refused_by_name() -> None:
 
 def test_rests_near_singular_poses_include_damping() -> None:
     scenario = parse_scenario(planar_task_text(), "planar", {"task.singular_value": 0.9})
-    analysis = analyse_linear_loop(scenario, pose=find_mean_pose(scenario), roots=1)
+    analysis = LinearAnalysis.compute(scenario, pose=find_mean_pose(scenario), roots=1)
     assert any("rests near a singular pose" in note for note in analysis.notes)

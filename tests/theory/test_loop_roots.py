@@ -17,7 +17,6 @@ from trilat_net.analysis.run_end import RunEnd
 from trilat_net.analysis.theory.loop_roots import (
     find_log_roots,
     find_run_roots,
-    resolve_final_scenario,
 )
 from trilat_net.analysis.timeline import Timeline
 from trilat_net.scenario import Scenario, load_scenario
@@ -234,7 +233,7 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
 def test_roots_follow_the_last_command() -> None:
     scenario = make_pair_scenario(**{"link.delay_ms": 200.0, "duration_s": 14.0})
     log = make_log_with_commands(scenario, "s", (3.0, SLOWER))
-    final = resolve_final_scenario(log)
+    final = Timeline(log).final_scenario
     assert [change.link for change in final.timeline] == ["m->s"]
     slower = make_pair_scenario(
         **{"link.delay_ms": 200.0, "links.m->s": SLOWER["to"], "duration_s": 14.0}

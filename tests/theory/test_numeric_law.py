@@ -14,7 +14,7 @@ from tests.plugged_laws import Line
 from tests.unit_arm import CLAMP
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.equilibrium import find_equilibrium, follow_equilibrium
-from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
+from trilat_net.analysis.theory.floquet import SampledLoop
 from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.core.step.vectors import Array
@@ -91,9 +91,9 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
     same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
     roots_of_memory = list_roots(
-        compute_sampled_spectrum(OperatingConditions.derive(theirs), same)
+        SampledLoop(OperatingConditions.derive(theirs)).compute_spectrum(same)
     )
-    known = list_roots(compute_sampled_spectrum(OperatingConditions.derive(ours), rest))
+    known = list_roots(SampledLoop(OperatingConditions.derive(ours)).compute_spectrum(rest))
     same_bits = scheme == "second_order"
     assert np.allclose(
         roots_of_memory[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2

@@ -22,7 +22,7 @@ from tests.theory.figures_of_runs import (
     find_value,
     measure_run,
 )
-from trilat_net.analysis.theory import analyse_linear_loop
+from trilat_net.analysis.theory import LinearAnalysis
 from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.scenario import load_scenario
 
@@ -81,7 +81,9 @@ def test_free_motions_error_grows_with_delay() -> None:
 def test_about_one_rest_some_delay_damps_common_motion(
     delay_ms: float, rate_per_s: float
 ) -> None:
-    analysis = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
+    analysis = LinearAnalysis.compute(
+        "free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337)
+    )
     assert analysis.decisive.rightmost is not None
     assert analysis.decisive.rightmost.s.real == approximate_figure(rate_per_s, 0.001)
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.theory.networks import hold_by_spring
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
-from trilat_net.analysis.theory.frequency_search import build_frequency_grid, refine_frequencies
+from trilat_net.analysis.theory.frequency_search import build_frequency_grid, refine_response
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 from trilat_net.analysis.theory.port_analysis import (
@@ -18,12 +18,7 @@ from trilat_net.analysis.theory.port_analysis import (
 from trilat_net.analysis.theory.port_passivity import Passivity
 from trilat_net.analysis.theory.port_response import (
     build_admittance,
-    clamp_site,
     evaluate_transfer,
-    find_site_ports,
-    list_port_sites,
-    parse_port_site,
-    to_imaginary_axis,
 )
 from trilat_net.scenario import Scenario, load_scenario
 
@@ -48,19 +43,16 @@ def linearise_at_pose(
 
 def build_grid(loop: LinearLoop) -> np.ndarray:
     delay_s = loop.longest_delay_s
-    return refine_frequencies(
-        build_admittance(loop), build_frequency_grid(1e-3, 100.0, delay_s)
-    )
+    w, _ = refine_response(build_admittance(loop), build_frequency_grid(1e-3, 100.0, delay_s))
+    return w
 
 
 def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> Passivity:
     output = build_proof_output(now, loop)
     assert output is not None
-    beta = np.repeat(
-        np.ones(len(list_port_sites(loop))) if ones else compute_proof_weights(now), 2
-    )
+    beta = np.repeat(np.ones(len(loop.sites)) if ones else compute_proof_weights(now), 2)
     return Passivity.check(
-        lambda at: evaluate_transfer(loop, to_imaginary_axis(at), output),
+        lambda at: evaluate_transfer(loop, 1j * at, output),
         build_grid(loop),
         beta,
     )
@@ -147,7 +139,7 @@ def test_laws_without_r_lack_the_proofs_output() -> None:
 def test_r_is_read_as_qd_plus_lambda_e() -> None:
     """At a frequency where the delay turns by a half, r = qd + Lambda (q + mean of the peers' q)."""
     _, now, _, loop = linearise_at_pose("free")
-    s = to_imaginary_axis(np.array([np.pi / 0.2]))
+    s = 1j * np.array([np.pi / 0.2])
     output = build_proof_output(now, loop)
     assert output is not None
     qd = evaluate_transfer(loop, s)[0]
@@ -163,9 +155,9 @@ def test_statics_share_the_force_by_dominance() -> None:
     beta = scenario.beta
     assert beta is not None
     Y = build_admittance(loop)(np.array([1e-5]))[0]
-    slave = find_site_ports(loop, "s")
+    slave = loop.find_site_ports("s")
     for index, site in enumerate(("m1", "m2")):
-        site_ports = find_site_ports(loop, site)
+        site_ports = loop.find_site_ports(site)
         felt = np.linalg.solve(Y[np.ix_(site_ports, site_ports)], Y[np.ix_(site_ports, slave)])
         np.testing.assert_allclose(felt.real, np.eye(2) * beta[2] / beta[index], atol=1e-3)
         np.testing.assert_allclose(felt.imag, 0.0, atol=1e-3)
@@ -191,8 +183,8 @@ def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: floa
 def test_clamped_sites_make_learnt_gravity_wind_up() -> None:
     """Impedance as 1 / w^2 towards zero, its phase that of a negative damper."""
     _, _, _, loop = linearise_at_pose("two_sites", ALONE["two_sites"])
-    held = clamp_site(loop, "s")
-    assert {parse_port_site(name) for name in held.inputs} == {"m"}
+    held = loop.clamp_site("s")
+    assert held.sites == ("m",)
     Z = 1.0 / build_admittance(held)(np.array([1e-3, 2e-3]))[:, 0, 0]
     assert abs(Z[0] / Z[1]) == pytest.approx(4.0, rel=1e-2)
     assert abs(np.angle(Z[0])) == pytest.approx(np.pi, abs=0.02)

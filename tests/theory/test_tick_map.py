@@ -13,7 +13,7 @@ from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.analysis.theory.floquet import (
-    compute_sampled_spectrum,
+    SampledLoop,
     discretise_zero_order_hold,
 )
 from trilat_net.analysis.theory.linear_loop import LinearLoop
@@ -28,8 +28,7 @@ def compute_spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spec
     now = OperatingConditions.derive(scenario)
     rest = find_equilibrium(scenario, POSE)
     continuous = Spectrum.of_loop(LinearLoop.of_conditions(now, rest), wanted)
-    spectrum = compute_sampled_spectrum(now, rest, wanted)
-    assert spectrum is not None
+    spectrum = SampledLoop(now).compute_spectrum(rest, wanted)
     return continuous, spectrum
 
 
@@ -183,8 +182,7 @@ def test_a_growing_swing_matches_a_run() -> None:
     )
     now = OperatingConditions.derive(scenario)
     rest = find_equilibrium(scenario, (0.3005, 0.0))
-    spectrum = compute_sampled_spectrum(now, rest, 2)
-    assert spectrum is not None
+    spectrum = SampledLoop(now).compute_spectrum(rest, 2)
     root = spectrum.roots[0].s
     run = make_trajectories(scenario).sites["m"]
     late = run.t_s > 8.0

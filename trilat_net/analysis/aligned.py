@@ -311,10 +311,10 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
 
 
 def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
-    """Marks the records in which an arm is being brought to rest, or was until shortly before.
+    """Marks the records in which an arm is brought to rest, and those of a short time after it.
 
-    The torque of these records may differ from that of the control law. The arm is in one of
-    the `RESTING_MODES`, or was in one of them within the last `RESUMING_S`.
+    The recorded torque may differ there from the torque of the control law. The arm is in one
+    of the `RESTING_MODES`, or was in one of these modes within the last `RESUMING_S` seconds.
 
     Args:
         modes: Mode of each record.

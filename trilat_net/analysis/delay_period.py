@@ -33,22 +33,6 @@ If there is no such span, the span with the smallest change is used, up to half 
 """
 
 
-def find_link_period_s(link: LinkBase) -> float | None:
-    """Returns the period after which the delay of a link repeats, in s.
-
-    For example, a sinusoidal delay of 0.5 Hz has a period of 2 s.
-
-    Args:
-        link: Delay model of the link.
-
-    Returns:
-        The period, or `None` if the delay is constant, random or measured, or follows a trace
-        that ends.
-    """
-    repetition_s = link.repetition_s
-    return None if repetition_s is None else float(repetition_s)
-
-
 def _find_common_period(cycles: Iterable[Fraction], common_hz: int) -> Fraction:
     """Returns the shortest time that contains a whole number of ticks and of all cycles, in s.
 
@@ -160,26 +144,9 @@ class DelayPeriod(NamedTuple):
         Args:
             scenario: The scenario.
         """
-        links = [find_final_link(scenario, name) for name in scenario.links]
+        links = [scenario.find_final_link(name) for name in scenario.links]
         rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
         return cls.of_links(links, rates_hz)
-
-
-def find_final_link(scenario: Scenario, name: str) -> LinkBase:
-    """Returns the delay model of a link in effect at the end of a scenario.
-
-    The linear analysis of a run uses this model, because it describes motion about the final
-    pose.
-
-    Args:
-        scenario: The scenario. Its timeline may change the link.
-        name: Name of the link, for example "m1->s".
-    """
-    end_ns = round(scenario.duration_s * 1e9)
-    link: LinkBase = scenario.links[name]
-    for from_ns, later_link in scenario.scheduled_links(name):
-        link = later_link if from_ns <= end_ns else link
-    return link
 
 
 def find_burst_interval_s(scenario: Scenario) -> float | None:
@@ -199,7 +166,7 @@ def find_burst_interval_s(scenario: Scenario) -> float | None:
     """
     intervals_s = []
     for name in scenario.links:
-        link = find_final_link(scenario, name)
+        link = scenario.find_final_link(name)
         if link.loss_burst <= 1.0 or not 0.0 < link.loss < link.loss_bad:
             continue
         leave_probability = 1.0 - (1.0 - 1.0 / link.loss_burst) / link.loss_bad

@@ -71,7 +71,7 @@ class _Messages(NamedTuple):
     size: "array[int]"
 
 
-class FileInventory:
+class _FileInventory:
     """Contents of one or several MCAP files: channels, message counts, times and damage.
 
     MCAP is the file format of the logs. Several files are treated as the parts of one log.
@@ -290,7 +290,7 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
             return None
         return lambda done, total: progress(number * total + done, 2 * total)
 
-    inventory = FileInventory(paths, report_pass(0))
+    inventory = _FileInventory(paths, report_pass(0))
     facts: JsonObject = {
         "files": inventory.files,
         "kind": "mcap",
@@ -485,9 +485,9 @@ def _compute_percentiles(
 
 
 def _count_executed_ticks(log: Log, site: str) -> int | None:
-    """Returns how many control periods (ticks) an arm's process executed, by its own report.
+    """Returns the number of control periods (ticks) that the process of an arm executed.
 
-    The process reports this number in its event "end" at the end of a run.
+    The process itself reports the number in its event "end" at the end of a run.
 
     Args:
         log: The log of the run.

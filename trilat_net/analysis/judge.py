@@ -3,17 +3,16 @@
 All commands of the program use this module and therefore reach the same decision. `certify_run`
 judges the log of a run from three kinds of evidence: the energy function V of the stability
 proof, repetitions of the run with small disturbances (twins), and the characteristic roots of
-the linearised control loop. `judge_virtual_run` judges a simulated run without a log, such as
-one run of a parameter sweep. To save computing time, it computes V only if V may change the
-decision.
+the linearised control loop. `VirtualRun` judges a simulated run without a log, such as one run
+of a parameter sweep. To save computing time, it computes V only if V may change the decision.
 
 Invariant:
-    - All commands decide with `analysis.stability_decision.decide_stability`, using roots from
+    - All commands decide with `stability_decision.RunFindings.decide`, using roots from
       `loop_roots`.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from functools import cached_property
 
 import msgspec
 
@@ -24,13 +23,12 @@ from .blas_threads import limit_blas_threads
 from .certificate.observed_energy import ObservedEnergy
 from .certificate.premise_quantities import MissingFunctional
 from .certificate.stability_certificate import Certificate
-from .decision_facts import LoopRoots, RunFindings, StabilityDecision
-from .delay_period import find_final_link
 from .run_end import RunEnd, Stability
 from .run_remarks import RunCircumstances
-from .stability_decision import decide_stability, is_decided_by_roots
-from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
+from .stability_decision import LoopRoots, RunFindings, StabilityDecision
+from .theory.loop_roots import find_log_roots, find_run_roots
 from .theory.operating_point import has_lasting_delays
+from .timeline import Timeline
 from .twins.twin_growth import TwinGrowth
 
 
@@ -48,7 +46,7 @@ def list_law_proofs(scenario: Scenario) -> list[str]:
     """
     if any(change.dominance for change in scenario.timeline):
         return []
-    links = {name: find_final_link(scenario, name) for name in scenario.links}
+    links = {name: scenario.find_final_link(name) for name in scenario.links}
     final_scenario = msgspec.structs.replace(scenario, links=links, timeline=())
     proofs = []
     for _, law, situation in final_scenario.law_situations():
@@ -89,7 +87,7 @@ def certify_run(
     if twins != 0:
         growth = TwinGrowth.of_log(log, certificate.end, twins, own_laws=own_laws)
 
-    final_scenario = resolve_final_scenario(log)
+    final_scenario = Timeline(log).final_scenario
     roots = find_log_roots(log, own_laws=own_laws)
     conditions = final_scenario.describe_law_conditions(ticks_grow=roots.is_refutation)
 
@@ -111,81 +109,88 @@ The records of so many ticks need half a gigabyte of memory.
 """
 
 
-class _VirtualJudgement(NamedTuple):
-    """Judgement whether a simulated run is stable, if the simulation wrote no log.
+class VirtualRun:
+    """A simulated run without a log, with all evidence on whether the run is stable.
 
-    Parameter sweeps use it, because writing and reading a log for each run would take longer
-    than the run.
-
-    Attributes:
-        end: How the motion ends.
-        roots: Roots of the loop at the end of the run.
-        twins: How small pushes in repeated runs develop. `None` if the roots decide without
-            them.
-        decision: The decision.
-    """
-
-    end: RunEnd
-    roots: LoopRoots
-    twins: TwinGrowth | None
-    decision: StabilityDecision
-
-
-@limit_blas_threads()
-def judge_virtual_run(
-    scenario: Scenario, run: FusedRun, end: RunEnd | None = None
-) -> _VirtualJudgement:
-    """Judges a simulated run as its certificate would, without a log.
-
-    Twins, one per joint, are executed only if they may change the decision. The run is repeated
-    with all its records only if it has settled or is open, if its laws have an energy function
-    V or declare energies, and if it has at most `MAX_RECORDED_TICKS` ticks. Energies, which
-    require the records, may prove that the run is stable, or contradict that it settled.
+    Parameter sweeps use this class, because writing and reading a log for each run would take
+    longer than the run. Each piece of evidence is computed when it is first needed.
 
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.
         run: The run in the fused loop.
         end: How the motion ends. If `None`, this is determined from the run.
     """
-    # the run may have been longer or shorter than its scenario states
-    executed_scenario = scenario
-    if run.diverged_s is None:
-        executed_scenario = msgspec.structs.replace(scenario, duration_s=run.ran_s)
-    if end is None:
-        end = RunEnd.of_run(run, executed_scenario)
-    findings = RunFindings(
-        end=end,
-        roots=find_run_roots(executed_scenario, run),
-        law_proofs=list_law_proofs(executed_scenario),
-    )
-    twins = None
-    if not is_decided_by_roots(findings):
-        twins = TwinGrowth.of_scenario(executed_scenario, end, run.ran_s)
-        findings = findings._replace(twins=twins)
-    decision = decide_stability(findings)
-    # only energies, which need the records of the run, may change a weak decision
-    is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)
-    ticks = (
-        sum(site.rate_hz for site in executed_scenario.sites.values())
-        * executed_scenario.duration_s
-    )
-    if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(executed_scenario):
-        # Only a written log contains the memories from which laws compute declared energies.
-        if ObservedEnergy.find_laws(executed_scenario, own_laws=True):
-            log: Log = SimulatedLog(executed_scenario)
-        else:
-            log = FusedRun.simulate_log(executed_scenario)
-        certificate_of_log = Certificate.of_log(log, own_laws=True)
-        certificate = replace(
-            certificate_of_log,
-            roots=findings.roots,
-            twins=twins,
-            law_proofs=tuple(findings.law_proofs),
-            has_lasting_delays=has_lasting_delays(executed_scenario),
+
+    def __init__(self, scenario: Scenario, run: FusedRun, end: RunEnd | None = None) -> None:
+        # the run may have been longer or shorter than its scenario states
+        self._scenario = scenario
+        if run.diverged_s is None:
+            self._scenario = msgspec.structs.replace(scenario, duration_s=run.ran_s)
+        self._run = run
+        self._end = end
+
+    @cached_property
+    def end(self) -> RunEnd:
+        """How the motion of the arms ends."""
+        if self._end is not None:
+            return self._end
+        return RunEnd.of_run(self._run, self._scenario)
+
+    @cached_property
+    def roots(self) -> LoopRoots:
+        """Roots of the control loop at the end of the run."""
+        return find_run_roots(self._scenario, self._run)
+
+    @cached_property
+    @limit_blas_threads()
+    def twins(self) -> TwinGrowth | None:
+        """How small pushes in repeated runs develop, one per joint.
+
+        `None` if the roots decide without them.
+        """
+        if self._findings.is_decided_by_roots:
+            return None
+        return TwinGrowth.of_scenario(self._scenario, self.end, self._run.ran_s)
+
+    @cached_property
+    def _findings(self) -> RunFindings:
+        """The evidence on the run without twins and without energies."""
+        return RunFindings(
+            end=self.end, roots=self.roots, law_proofs=list_law_proofs(self._scenario)
         )
-        decision = certificate.decision
-    assert findings.roots is not None
-    return _VirtualJudgement(end, findings.roots, twins, decision)
+
+    @cached_property
+    @limit_blas_threads()
+    def decision(self) -> StabilityDecision:
+        """The decision whether the run is stable, as its certificate would make it.
+
+        The run is repeated with all its records only if it has settled or is open, if its laws
+        have an energy function V or declare energies, and if it has at most
+        `MAX_RECORDED_TICKS` ticks. Energies, which require the records, may prove that the run
+        is stable, or contradict that it settled.
+        """
+        scenario = self._scenario
+        decision = self._findings._replace(twins=self.twins).decide()
+        # only energies, which need the records of the run, may change a weak decision
+        is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)
+        ticks_per_s = sum(site.rate_hz for site in scenario.sites.values())
+        ticks = ticks_per_s * scenario.duration_s
+        if not is_weak or ticks > MAX_RECORDED_TICKS or not _has_energies(scenario):
+            return decision
+
+        # Only a written log contains the memories from which laws compute declared energies.
+        if ObservedEnergy.find_laws(scenario, own_laws=True):
+            log: Log = SimulatedLog(scenario)
+        else:
+            log = FusedRun.simulate_log(scenario)
+        certificate = replace(
+            Certificate.of_log(log, own_laws=True),
+            roots=self.roots,
+            twins=self.twins,
+            law_proofs=tuple(self._findings.law_proofs),
+            has_lasting_delays=has_lasting_delays(scenario),
+        )
+        return certificate.decision
 
 
 def _has_energies(scenario: Scenario) -> bool:

@@ -169,10 +169,9 @@ class _Arrivals(NamedTuple):
 
 
 def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
-    """Reads from a log which messages of other arms arrived at an arm, and when.
+    """Reads from a log the samples of other arms that arrived at an arm, with their times.
 
-    Such a message, called a sample, contains the state that an arm sends in every control
-    period.
+    A sample is the message with its state that an arm sends in every control period.
 
     Args:
         log: The log of the run.
@@ -208,7 +207,9 @@ def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
 
 
 def _count_sent(log: Log, peer: str, newest_sample: int) -> int:
-    """Returns how many messages with its state an arm has sent, according to the log.
+    """Returns the number of samples that an arm has sent, according to the log.
+
+    A sample is a message with the state of the arm.
 
     Args:
         log: The log of the run.
@@ -661,9 +662,9 @@ def _count_samples(
     sent: int,
     judged: int,
 ) -> SampleCounts:
-    """Counts the messages (samples) of a network link by their fate, see `SampleCounts`.
+    """Counts the samples of a network link by what happened to them, see `SampleCounts`.
 
-    Examples are samples that were used, lost, or replaced by a newer one before their use.
+    For example, a sample was used, was lost, or was replaced by a newer sample before its use.
 
     Args:
         site_log: Log of the receiver.

@@ -277,7 +277,79 @@ class RunEnd(NamedTuple):
             run: The run in the fused loop.
             scenario: Scenario of the run, whose duration may differ from that of the run.
         """
-        return RunTrace(run.buckets, run.tau_x, run.diverged_s).classify_end(scenario)
+        return RunTrace.of_run(run).classify_end(scenario)
+
+    @classmethod
+    def of_reduced_records(
+        cls,
+        scenario: Scenario,
+        buckets: Sequence[Array],
+        tau_x: Sequence[Array],
+        diverged_at_s: float | None = None,
+    ) -> "RunEnd":
+        """Judges whether the motion of the arms decayed, from records that were reduced before.
+
+        Args:
+            scenario: Scenario of the run.
+            buckets: The reduced records of each site, from `reduce_records`, in scenario order.
+            tau_x: Torque of operator and environment in the last record of each site, shape
+                (n,) each, in N m.
+            diverged_at_s: When the first site exceeded its limits, in s, or `None` if no site
+                did.
+        """
+        return RunTrace(buckets, tau_x, diverged_at_s).classify_end(scenario)
+
+    @staticmethod
+    def reduce_records(
+        bucket: Ints,
+        e: Array,
+        qd: Array,
+        q: Array,
+        into: Array,
+    ) -> Array:
+        """Adds further records of a site to the data from which the end of its run is judged.
+
+        The records of an interval (bucket) are reduced to the largest |e|, the largest |qd| and
+        the last q of each joint (see `RunTrace`). In task space, e has as many columns as the
+        task has coordinates. Missing columns of e, qd or q are filled with zeros.
+
+        Args:
+            bucket: Interval index of each record, in ascending order, shape (K,).
+            e: Synchronisation errors, shape (K, n).
+            qd: Joint velocities, shape (K, n), in rad/s.
+            q: Joint angles, shape (K, n), in rad.
+            into: Data of all earlier records, which may be modified in place and may have spare
+                rows.
+
+        Returns:
+            The data including the new records.
+        """
+        if not len(bucket):
+            return into
+        joints = max(q.shape[1], e.shape[1])
+
+        def pad(x: Array) -> Array:
+            missing = joints - x.shape[1]
+            return np.pad(x, ((0, 0), (0, missing)))
+
+        magnitudes = np.abs(np.hstack([pad(e), pad(qd)]))
+        if not len(into):
+            into = np.zeros((0, 3 * joints))
+        lacking = int(bucket[-1]) + 1 - len(into)
+        if lacking > 0:
+            # half as much again, so that a long run is not copied for every batch
+            spare = len(into) // 2
+            extra = np.full((lacking + spare, 3 * joints), -1.0)
+            into = np.vstack([into, extra])
+
+        starts = np.flatnonzero(np.diff(bucket, prepend=-1))
+        last_records = np.append(starts[1:], len(q)) - 1
+        rows = bucket[starts]
+        peaks = np.maximum.reduceat(magnitudes, starts, axis=0)
+        earlier_peaks = into[rows, : 2 * joints]
+        into[rows, : 2 * joints] = np.maximum(earlier_peaks, peaks)
+        into[rows, 2 * joints :] = pad(q)[last_records]
+        return into
 
     @staticmethod
     def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
@@ -350,7 +422,7 @@ class RunTrace(NamedTuple):
         push_times_s = []
         for site in log.sites:
             site_log = log[site]
-            site_buckets = cls.reduce_records(
+            site_buckets = RunEnd.reduce_records(
                 bucket=site_log.tick * BUCKETS_PER_S // site_log.rate_hz,
                 e=site_log.e,
                 qd=site_log.qd,
@@ -370,57 +442,16 @@ class RunTrace(NamedTuple):
             changed_until_s=max(change_times_s, default=0.0),
         )
 
-    @staticmethod
-    def reduce_records(
-        bucket: Ints,
-        e: Array,
-        qd: Array,
-        q: Array,
-        into: Array,
-    ) -> Array:
-        """Adds further records of a site to the data from which the end of its run is judged.
+    @classmethod
+    def of_run(cls, run: FusedRun) -> "RunTrace":
+        """Returns the data needed to judge the end of a simulated run.
 
-        The records of an interval (bucket) are reduced to the largest |e|, the largest |qd| and
-        the last q of each joint (see `RunTrace`). In task space, e has as many columns as the
-        task has coordinates. Missing columns of e, qd or q are filled with zeros.
+        The fused loop reduces the records of a run while it simulates the run.
 
         Args:
-            bucket: Interval index of each record, in ascending order, shape (K,).
-            e: Synchronisation errors, shape (K, n).
-            qd: Joint velocities, shape (K, n), in rad/s.
-            q: Joint angles, shape (K, n), in rad.
-            into: Data of all earlier records, which may be modified in place and may have spare
-                rows.
-
-        Returns:
-            The data including the new records.
+            run: The run in the fused loop.
         """
-        if not len(bucket):
-            return into
-        joints = max(q.shape[1], e.shape[1])
-
-        def pad(x: Array) -> Array:
-            missing = joints - x.shape[1]
-            return np.pad(x, ((0, 0), (0, missing)))
-
-        magnitudes = np.abs(np.hstack([pad(e), pad(qd)]))
-        if not len(into):
-            into = np.zeros((0, 3 * joints))
-        lacking = int(bucket[-1]) + 1 - len(into)
-        if lacking > 0:
-            # half as much again, so that a long run is not copied for every batch
-            spare = len(into) // 2
-            extra = np.full((lacking + spare, 3 * joints), -1.0)
-            into = np.vstack([into, extra])
-
-        starts = np.flatnonzero(np.diff(bucket, prepend=-1))
-        last_records = np.append(starts[1:], len(q)) - 1
-        rows = bucket[starts]
-        peaks = np.maximum.reduceat(magnitudes, starts, axis=0)
-        earlier_peaks = into[rows, : 2 * joints]
-        into[rows, : 2 * joints] = np.maximum(earlier_peaks, peaks)
-        into[rows, 2 * joints :] = pad(q)[last_records]
-        return into
+        return cls(run.buckets, run.tau_x, run.diverged_s)
 
     def classify_end(self, scenario: Scenario) -> RunEnd:
         """Judges from reduced data whether the motion decayed at the end of a run.

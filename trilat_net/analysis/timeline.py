@@ -20,7 +20,7 @@ from ..core import HELD_OVERRUN_TICKS, LifeAlarm
 from ..errors import count_nouns
 from ..log import Log
 from ..net import MODES, ModeMeaning
-from ..scenario import Change, LinkBase
+from ..scenario import Change, LinkBase, Scenario
 
 
 class _AppliedChange(NamedTuple):
@@ -95,7 +95,7 @@ class _ModeInterval(NamedTuple):
 
 
 class _RaisedAlarm(NamedTuple):
-    """An interval in which a site raised an alarm: it held, was stopped, or had a fault.
+    """An interval in which a site raised an alarm: a hold, a stop or a fault of its arm.
 
     Alarms exist only at sites whose rule for silent peers (`on_stale` of the scenario) is
     "glide". With this rule an arm comes to rest smoothly when it no longer hears from its
@@ -258,6 +258,20 @@ class Timeline:
             if is_command and has_effect:
                 effective_commands.append(change)
         return effective_commands
+
+    @property
+    def final_scenario(self) -> Scenario:
+        """The scenario of the log, with the users' commands of the run as planned changes.
+
+        Its duration is the recorded duration. The settings in effect at its end are therefore
+        those of the final control loop.
+        """
+        scenario = self._log.scenario
+        commands = [change for change in self.effective_commands if not change.order]
+        timeline = sorted([*scenario.timeline, *commands], key=lambda change: change.at_s)
+        return msgspec.structs.replace(
+            scenario, timeline=tuple(timeline), duration_s=self.end_s
+        )
 
     @cached_property
     def stated_links(self) -> dict[str, StatedLink]:

@@ -632,7 +632,7 @@ def _find_arm_damping(
     J: Array,
     t_s: Array,
 ) -> float:
-    """Returns the arm's own least damping along a wall's normal in contact, in N s/m.
+    """Returns the least damping of an arm along a wall's normal during contact, in N s/m.
 
     The damping is 1 / (n'J D^-1 J'n), with the normal n, the Jacobian J and the damping D of
     the joints. Only dampers that act continuously are included.

@@ -23,7 +23,7 @@ from ..log import MIN_COVERAGE, Log, open_log
 from ..scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
-    from ..analysis import LinearAnalysis
+    from ..analysis import LinearAnalysis, PushedTwins
     from ..presentation import Conclusion
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario
@@ -183,6 +183,40 @@ def certify(
     return certify_run(log_of_run, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
 
 
+def twin(
+    log: AnyLog,
+    at_s: float = 0.0,
+    push: Mapping[str, float] | Sequence[str] = (),
+    delta: str = "",
+) -> "PushedTwins":
+    """Repeats a recorded run with small pushes at a given time, as `trilat twin` does.
+
+    A twin is a repeated run in which one quantity was changed by a small amount, the push. The
+    result shows how the difference between each twin and the run develops.
+
+    >>> found = tn.twin(tn.simulate("two_sites", duration_s=4), at_s=1, push={"m.q1": 1e-6})
+    >>> found.growth.pushes[0].rate_per_s < 0.0
+    True
+
+    Args:
+        log: The log, or its path.
+        at_s: Time of the pushes, in s.
+        push: Sizes by target, as in `{"m1.q1": 1e-6}`, with one twin per push. A target is a
+            joint's angle, `m1.q1`, a joint's speed, `m1.qd1`, an estimate, `m1.theta1`, or
+            several quantities in a random direction, `m1.q` or `q`. By default the pushes are
+            those of `certify`. If they are made at 0 s, their growth is judged as in `certify`.
+        delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+
+    Raises:
+        UsageError: There is no such target, time or range.
+        LogError: The log cannot be read, or cannot be executed again.
+        CodeWithheld: The code of a law of the log may not be executed.
+    """
+    from ..analysis import PushedTwins
+
+    return PushedTwins.of_log(_open(log), at_s, push, delta)
+
+
 def metrics(log: AnyLog) -> LogMetrics:
     """Computes the metrics of tracking, effort, energy, force sharing and the network of a run.
 
@@ -292,7 +326,7 @@ def linear(
         ScenarioError: The scenario is invalid, or has no linear loop.
         UsageError: Another argument is invalid.
     """
-    from ..analysis import analyse_linear_loop
+    from ..analysis import LinearAnalysis
 
     try:
         angles = None if pose is None else tuple(map(float, pose))
@@ -304,7 +338,7 @@ def linear(
     source: Scenario | Log = load_scenario(scenario, set)
     if isinstance(scenario, Log) and not set:
         source = scenario
-    return analyse_linear_loop(
+    return LinearAnalysis.compute(
         source,
         pose=angles,
         roots=roots,

@@ -383,9 +383,9 @@ class NetworkNeeds(NamedTuple):
         try:
             require_libraries("scipy")
             # Imported here because the far end does not need SciPy.
-            from ..analysis import analyse_linear_loop
+            from ..analysis import LinearAnalysis
 
-            loop = analyse_linear_loop(load_scenario(scenario, overrides))
+            loop = LinearAnalysis.compute(load_scenario(scenario, overrides))
         except (ScenarioError, RunFailed, UsageError) as error:
             description = f"the linear theory does not cover its delay margin: {error}"
         else:

@@ -67,7 +67,7 @@ class RotationVectors:
     def __init__(self, turns: Array) -> None:
         self._turns = turns
 
-    def as_quaternion_parts(self) -> tuple[Array, Array]:
+    def _as_quaternion_parts(self) -> tuple[Array, Array]:
         """Computes the unit quaternions of the rotations, as scalar and vector parts.
 
         The quaternion of a rotation vector r with the angle a = |r| is
@@ -93,7 +93,7 @@ class RotationVectors:
         Returns:
             The quaternions w, x, y, z, shape (K, 4).
         """
-        w, v = self.as_quaternion_parts()
+        w, v = self._as_quaternion_parts()
         return align_signs(np.hstack([w, v]))
 
     def as_matrix_columns(self) -> Array:
@@ -108,7 +108,7 @@ class RotationVectors:
             The entries `MATRIX_ENTRIES`, shape (..., 6) for rotation vectors of shape (..., 3).
         """
         rows = RotationVectors(np.reshape(self._turns, (-1, 3)))
-        w, v = rows.as_quaternion_parts()
+        w, v = rows._as_quaternion_parts()
         # In the following, xy is twice the product of the components x and y, and so on.
         double = 2.0 * v
         wx, wy, wz = (w * double).T
@@ -177,8 +177,8 @@ class RotationVectors:
         Returns:
             Rotation vectors of at most half a turn, shape (K, 3), in rad.
         """
-        a, u = self.as_quaternion_parts()
-        b, v = RotationVectors(references).as_quaternion_parts()
+        a, u = self._as_quaternion_parts()
+        b, v = RotationVectors(references)._as_quaternion_parts()
         w = a * b + np.sum(u * v, axis=1, keepdims=True)
         p = b * u - a * v - np.cross(u, v)
 

@@ -16,6 +16,7 @@ from ..hooks import import_on_use, register_hooks
 __all__ = [
     # Text
     "MARKS",
+    "NEGATIVE_ENERGY_MEANING",
     "Block",
     "MarkedText",
     "TextTable",
@@ -71,6 +72,7 @@ if TYPE_CHECKING:
     from .foxglove_layout import write_foxglove_layout
     from .linear_text import describe_moving_states
     from .network_text import compose_benchmark, compose_doctor, compose_ping
+    from .observed_text import NEGATIVE_ENERGY_MEANING
     from .rerun_viewer import ViewerOptions, open_rerun
     from .result_text import MARKS, Block, MarkedText, TextTable, format_number
     from .style import FIGURE_FORMATS, REPORT_DPI, write_figure
@@ -91,6 +93,7 @@ else:
             "foxglove_layout": "write_foxglove_layout",
             "linear_text": "describe_moving_states",
             "network_text": "compose_benchmark compose_doctor compose_ping",
+            "observed_text": "NEGATIVE_ENERGY_MEANING",
             "rerun_viewer": "ViewerOptions open_rerun",
             "result_text": "Block MARKS MarkedText TextTable format_number",
             "style": "FIGURE_FORMATS REPORT_DPI style write_figure",

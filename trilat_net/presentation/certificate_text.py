@@ -25,17 +25,17 @@ from ..analysis import (
     EndBehaviour,
     EnergyBalance,
     EnvelopeTrend,
-    ObservedFinding,
     PushedTwins,
     Stability,
     TwinGrowth,
-    decision_facts,
     premise_quantities,
+    stability_decision,
     verdict_facts,
 )
 from ..core import Array
 from ..errors import count_nouns
 from .end_text import name_behaviour
+from .observed_text import NEGATIVE_ENERGY_MEANING
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
@@ -185,8 +185,8 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     observed = certificate.observed
     if observed is not None:
         lines.append(CertificateLine(_OBSERVED_MARKS[observed.finding], observed.text))
-        if observed.finding is ObservedFinding.NEGATIVE:
-            lines.append(CertificateLine("note", observed.finding.meaning))
+        if observed.finding == "negative":
+            lines.append(CertificateLine("note", NEGATIVE_ENERGY_MEANING))
 
     roots = certificate.roots
     if roots is not None:
@@ -337,7 +337,7 @@ def describe_theorem(certificate: Certificate) -> list[str]:
 
 
 def _compare_rates(
-    roots: decision_facts.LoopRoots | None, twins: TwinGrowth
+    roots: stability_decision.LoopRoots | None, twins: TwinGrowth
 ) -> list[CertificateLine]:
     """Returns a remark on why two decay rates differ, if they are printed differently.
 
@@ -489,10 +489,10 @@ _BALANCE_MARKS = {
     verdict_facts.StabilityFinding.NOT_JUDGED: "open",
 }
 _OBSERVED_MARKS = {
-    ObservedFinding.PASSIVE: "ok",
-    ObservedFinding.NEGATIVE: "open",
-    ObservedFinding.BROKEN: "FAIL",
-    ObservedFinding.NOT_JUDGED: "open",
+    "passive": "ok",
+    "negative": "open",
+    "broken": "FAIL",
+    "not_judged": "open",
 }
 _ROOT_MARKS = {"stable": "ok", "unstable": "open"}
 

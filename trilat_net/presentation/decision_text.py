@@ -11,17 +11,17 @@ Invariant:
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from ..analysis import EndBehaviour, decision_facts
+from ..analysis import EndBehaviour, stability_decision
 from ..errors import count_nouns, join_words
 from .verdict_text import THEOREM
 
 
-def _state_basis(decision: decision_facts.StabilityDecision) -> str:
+def _state_basis(decision: stability_decision.StabilityDecision) -> str:
     """Returns a phrase that names the basis of a decision. Empty if there is none."""
     return BASES[decision.basis](decision.findings)
 
 
-def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
+def _list_reasons(decision: stability_decision.StabilityDecision) -> list[str]:
     """Returns one or more sentences for each reason that prevents a better decision.
 
     Empty if the run is stable.
@@ -34,7 +34,7 @@ def _list_reasons(decision: decision_facts.StabilityDecision) -> list[str]:
     return reasons
 
 
-def _describe_roots(roots: decision_facts.LoopRoots) -> str:
+def _describe_roots(roots: stability_decision.LoopRoots) -> str:
     """Returns a sentence on the roots at the end of a run, or on why they are missing."""
     if not roots.verdict:
         return f"this rest: no roots: {roots.reason}"
@@ -49,7 +49,7 @@ def _describe_roots(roots: decision_facts.LoopRoots) -> str:
     return f"this rest: {roots.verdict}, {rate}{omega}{_describe_span(roots)}"
 
 
-def _describe_span(roots: decision_facts.LoopRoots) -> str:
+def _describe_span(roots: stability_decision.LoopRoots) -> str:
     """Returns a clause on the ticks and delays for which the roots were computed."""
     if roots.is_continuous:
         ages = ", of the mean ages" if roots.has_mean_ages else ""
@@ -83,7 +83,7 @@ def describe_tick_span(
     return f", over {span_s:.4g} s of the delays in use, +- {deviation_per_s:.1g} /s"
 
 
-def describe_left_out(roots: decision_facts.LoopRoots) -> str:
+def describe_left_out(roots: stability_decision.LoopRoots) -> str:
     """Returns a phrase about programs whose reaction the linear analysis ignores.
 
     A program that moves an arm can run arbitrary code, which cannot be linearised. The phrase
@@ -99,7 +99,7 @@ def describe_left_out(roots: decision_facts.LoopRoots) -> str:
     return f"how the programs at {join_words(roots.programs)} react to the arms"
 
 
-def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:
+def _describe_root_basis(roots: stability_decision.LoopRoots) -> str:
     """Returns the phrase after "rests on:" for decisions based on the roots of the loop.
 
     For example, "exact roots, slowest -0.832 /s" means that the slowest mode decays at a rate
@@ -113,17 +113,17 @@ def _describe_root_basis(roots: decision_facts.LoopRoots) -> str:
     return f"{name}, {decisive} {roots.rate_per_s:+.3g} /s"
 
 
-def _state_end(run: decision_facts.RunFindings) -> str:
+def _state_end(run: stability_decision.RunFindings) -> str:
     # The frequency of an oscillation is known only if all records are known.
     return f"the end of the run: {run.end._replace(frequency_hz=None).text}"
 
 
-def _state_roots(run: decision_facts.RunFindings) -> str:
+def _state_roots(run: stability_decision.RunFindings) -> str:
     assert run.roots is not None
     return _describe_root_basis(run.roots)
 
 
-def _state_proofs(run: decision_facts.RunFindings) -> str:
+def _state_proofs(run: stability_decision.RunFindings) -> str:
     """Returns phrases that name every proof of stability, with exact roots last."""
     proofs = [THEOREM] if run.is_covered else []
     proofs += run.law_proofs
@@ -132,7 +132,7 @@ def _state_proofs(run: decision_facts.RunFindings) -> str:
     return "; ".join(proofs)
 
 
-def _state_pushes(run: decision_facts.RunFindings) -> str:
+def _state_pushes(run: stability_decision.RunFindings) -> str:
     """Returns the basis for a settled run: the number of pushes, and why there is no proof.
 
     For example: "8 pushes over 12 s, all of which died away; its roots are not exact".
@@ -154,12 +154,12 @@ def _state_pushes(run: decision_facts.RunFindings) -> str:
     return text
 
 
-def _describe_twins(run: decision_facts.RunFindings) -> str:
+def _describe_twins(run: stability_decision.RunFindings) -> str:
     assert run.twins is not None
     return run.twins.text
 
 
-BASES: dict[decision_facts.Basis, Callable[[decision_facts.RunFindings], str]] = {
+BASES: dict[stability_decision.Basis, Callable[[stability_decision.RunFindings], str]] = {
     "nothing": lambda _: "",
     "divergence": lambda run: run.end.text,
     "end": _state_end,
@@ -171,11 +171,11 @@ BASES: dict[decision_facts.Basis, Callable[[decision_facts.RunFindings], str]] =
 """For each basis of a decision, the function that describes it in a phrase."""
 
 
-def _list_missing_records(run: decision_facts.RunFindings) -> list[str]:
+def _list_missing_records(run: stability_decision.RunFindings) -> list[str]:
     return [f"no record of {site}" for site in run.end.missing_sites]
 
 
-def _describe_period(run: decision_facts.RunFindings) -> list[str]:
+def _describe_period(run: stability_decision.RunFindings) -> list[str]:
     """Returns a sentence about repetitions that were shorter than the period of the delays.
 
     Pushes that died away then prove little, because the delays in the rest of the period were
@@ -191,7 +191,7 @@ def _describe_period(run: decision_facts.RunFindings) -> list[str]:
     return [sentence]
 
 
-def _describe_growing_roots(run: decision_facts.RunFindings) -> list[str]:
+def _describe_growing_roots(run: stability_decision.RunFindings) -> list[str]:
     assert run.roots is not None
     return [run.roots.text]
 
@@ -202,7 +202,7 @@ def _describe_short_record(advised_s: float | None) -> str:
     return f"the run is too short to tell; a run of {advised_s:.3g} s would be long enough"
 
 
-def _describe_slow_decay(run: decision_facts.RunFindings) -> list[str]:
+def _describe_slow_decay(run: stability_decision.RunFindings) -> list[str]:
     assert run.roots is not None
     lasting = "drift" if run.end.behaviour is EndBehaviour.DRIFTS else "oscillation"
     sentence = (
@@ -212,18 +212,19 @@ def _describe_slow_decay(run: decision_facts.RunFindings) -> list[str]:
     return [sentence]
 
 
-def _explain_no_pushes(run: decision_facts.RunFindings) -> list[str]:
+def _explain_no_pushes(run: stability_decision.RunFindings) -> list[str]:
     assert run.twins is not None
     return [f"no proof exists, and no pushes were judged: {run.twins.why}"]
 
 
-def _describe_few_bursts(run: decision_facts.RunFindings) -> list[str]:
+def _describe_few_bursts(run: stability_decision.RunFindings) -> list[str]:
     assert run.twins is not None
     bursts = f"{run.twins.judged_bursts:.2g} bursts of lost samples"
     return [f"{run.end.text}; the judged part has {bursts}, too few for an average"]
 
 
-OBSTACLES: dict[decision_facts.Obstacle, Callable[[decision_facts.RunFindings], list[str]]] = {
+_ReasonLister = Callable[[stability_decision.RunFindings], list[str]]
+OBSTACLES: dict[stability_decision.Obstacle, _ReasonLister] = {
     "divergence": lambda run: [run.end.text],
     "end": lambda run: list(run.end.reasons),
     "missing records": _list_missing_records,
@@ -243,11 +244,11 @@ record is written by `_list_reasons` itself.
 """
 
 DESCRIBERS: dict[type, Callable[[Any], str]] = {
-    decision_facts.StabilityDecision: _state_basis,
-    decision_facts.LoopRoots: _describe_roots,
+    stability_decision.StabilityDecision: _state_basis,
+    stability_decision.LoopRoots: _describe_roots,
 }
 """Functions that describe findings, keyed by the class of the finding."""
 SENTENCE_LISTERS: dict[type, Callable[[Any], Iterable[str]]] = {
-    decision_facts.StabilityDecision: _list_reasons
+    stability_decision.StabilityDecision: _list_reasons
 }
 """Function that lists the reasons for a decision, keyed by the class of the decision."""

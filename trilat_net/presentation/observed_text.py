@@ -7,7 +7,7 @@ names and numbers.
 from collections.abc import Callable
 from typing import Any
 
-from ..analysis import ObservedEnergy, ObservedFinding
+from ..analysis import ObservedEnergy
 from ..errors import count_nouns
 
 NEGATIVE_ENERGY_MEANING = (
@@ -18,10 +18,10 @@ NEGATIVE_ENERGY_MEANING = (
 )
 """Explanation of a negative energy, worded identically wherever users read it."""
 _FINDINGS = {
-    ObservedFinding.PASSIVE: "observed energy never below zero",
-    ObservedFinding.NEGATIVE: "observed energy below zero",
-    ObservedFinding.BROKEN: "the energies that a law declares do not add up",
-    ObservedFinding.NOT_JUDGED: "observed energy cannot be judged",
+    "passive": "observed energy never below zero",
+    "negative": "observed energy below zero",
+    "broken": "the energies that a law declares do not add up",
+    "not_judged": "observed energy cannot be judged",
 }
 
 
@@ -36,9 +36,9 @@ def _describe_cause(observed: ObservedEnergy) -> str:
         return f"the law of {', '.join(observed.undeclared_sites)} declares no energies"
     if observed.incomplete_sites:
         return f"records of {', '.join(observed.incomplete_sites)} are missing"
-    if observed.finding is ObservedFinding.BROKEN:
+    if observed.finding == "broken":
         return observed.premises[0].text
-    if observed.finding is ObservedFinding.NEGATIVE:
+    if observed.finding == "negative":
         lowest = min(observed.least, key=lambda energy: energy.amount_j)
         return f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
 
@@ -51,13 +51,7 @@ def _describe_cause(observed: ObservedEnergy) -> str:
     return text
 
 
-def _explain_finding(finding: ObservedFinding) -> str:
-    """Returns what a finding means for a run. Empty if it needs no explanation."""
-    return NEGATIVE_ENERGY_MEANING if finding is ObservedFinding.NEGATIVE else ""
-
-
 DESCRIBERS: dict[type, Callable[[Any], str]] = {
     ObservedEnergy: _describe_observed,
-    ObservedFinding: _explain_finding,
 }
 """Functions that describe findings, keyed by the class of the finding."""

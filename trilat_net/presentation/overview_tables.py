@@ -15,10 +15,9 @@ Invariant:
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from ..analysis import FileOverview
 from ..errors import count_nouns
 from ..log import describe_unknown_ends
-from ..results import JsonObject
+from ..results import JsonObject, Result
 from .result_text import Block, MarkedText, TextTable
 from .untrusted_text import sanitize
 
@@ -31,16 +30,16 @@ _FAULTY_ACCOUNT = re.compile(r"(missing|duplicate|reordered|refilled|overflowed)
 _SIZE_UNITS = {"GB": 10**9, "MB": 10**6, "kB": 10**3}
 
 
-def compose_overview(overview: FileOverview) -> Iterator[Block]:
+def compose_overview(overview: Result) -> Iterator[Block]:
     """Yields the text that describes the contents of log files.
 
     The text contains the session, the tables, the number of messages, the origin and the files.
     If trilat-net did not write the files, only the channels and the files are described.
 
     Args:
-        overview: Contents of the files.
+        overview: Contents of the files, with the keys of `trilat log info --json`.
     """
-    facts = overview.facts
+    facts = overview.to_dict()
     session: JsonObject | None = facts["session"]
     if session is not None:
         yield from _compose_session(facts, session)

@@ -393,6 +393,18 @@ class Scenario(Frozen, frozen=True, dict=True):
             if change.link == name:
                 yield change.start_ns, change.after
 
+    def find_final_link(self, name: str) -> LinkBase:
+        """Returns the settings of a link in effect at the end of the run.
+
+        Args:
+            name: Name of the link, for example "m1->s".
+        """
+        end_ns = round(self.duration_s * 1e9)
+        link: LinkBase = self.links[name]
+        for from_ns, later_link in self.scheduled_links(name):
+            link = later_link if from_ns <= end_ns else link
+        return link
+
     def _all_links(self) -> list[LinkBase]:
         """Returns the settings of all links, both initially and after planned changes.
 

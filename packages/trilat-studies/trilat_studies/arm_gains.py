@@ -42,8 +42,8 @@ import msgspec
 import numpy as np
 from scipy.optimize import brentq
 
-from trilat_net.analysis import EnvelopeFit, EnvelopeTrend, RestingLoop
-from trilat_net.core import BUCKETS_PER_S, Array
+from trilat_net.analysis import EnvelopeTrend, RestingLoop
+from trilat_net.core import Array
 from trilat_net.errors import LogError, UsageError
 from trilat_net.execution import FusedRun
 from trilat_net.log import open_log
@@ -64,8 +64,6 @@ _PUSH = 1e-6
 """Largest initial displacement of the joints of the first arm, in rad or m."""
 _SMALL = 1.0
 """Speed above which a motion is no longer considered small, in rad/s."""
-_STILL = 1e-7
-"""Fraction of the largest speed below which a speed is treated as rounding error."""
 _SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
 """Site names for each number of sites."""
 _SLACK = 0.05
@@ -725,13 +723,7 @@ class _GainSearch:
         durations_s = first_s * 2.0 ** np.arange(_EXTENSIONS)
         for end_s in durations_s.tolist():
             run.advance_to(end_s)
-            speeds = [site[:, 1] for site in run.maxima]
-            speed = np.max(speeds, axis=0)
-            t_s = np.arange(len(speed)) / BUCKETS_PER_S
-            floor = _STILL * speed.max()
-            speed_column = speed[:, np.newaxis]
-            fits = EnvelopeFit.fit_columns(t_s, speed_column, floor, falls_first=True)
-            fit = fits[0]
+            fit = self.loop.measure_growth(run)
             diverged = run.diverged_s is not None
             if diverged or fit.trend in _IS_STABLE:
                 break

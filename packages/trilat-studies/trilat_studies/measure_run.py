@@ -20,7 +20,6 @@ from trilat_net.analysis import (
     LogMetrics,
     Metric,
     RunEnd,
-    RunTrace,
 )
 from trilat_net.core import Array, compute_fingerprint
 from trilat_net.errors import ScenarioError
@@ -216,7 +215,6 @@ def _compute_run_metrics(
         buckets.append(stats.buckets)
         last_tau_x.append(stats.tau_x)
     all_ran = len(with_records) == len(site_stats)
-    trace = RunTrace(buckets, last_tau_x, diverged_at_s)
 
     synchronised_at_s = None
     if all_ran:
@@ -252,7 +250,7 @@ def _compute_run_metrics(
 
     return RunMetrics(
         simulated_s=max(durations_s, default=0.0),
-        end=trace.classify_end(scenario),
+        end=RunEnd.of_reduced_records(scenario, buckets, last_tau_x, diverged_at_s),
         synchronised_at_s=synchronised_at_s,
         peak_error_rad=find_largest("peak_error_rad"),
         rms_error_rad=find_largest("rms_error_rad"),

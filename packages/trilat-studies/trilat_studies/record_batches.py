@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trilat_net import process
-from trilat_net.analysis import NO_BUCKETS, RunEnd, RunTrace
+from trilat_net.analysis import NO_BUCKETS, RunEnd
 from trilat_net.core import BUCKETS_PER_S, Array, Site
 from trilat_net.execution import FusedRun, execute_virtual
 from trilat_net.log import Ints, compute_task_errors
@@ -84,10 +84,10 @@ class RecordBatch(NamedTuple):
                 there are no earlier records.
 
         Returns:
-            The updated summary, see `RunTrace.reduce_records`.
+            The updated summary, see `RunEnd.reduce_records`.
         """
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
-        return RunTrace.reduce_records(
+        return RunEnd.reduce_records(
             bucket=bucket,
             e=self.e,
             qd=self.qd,
@@ -366,5 +366,5 @@ def _join_run(
         records[name] = site_records
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
-    trace = RunTrace(buckets, last_tau_x, run.diverged_s)
-    return WholeRun(records, trace.classify_end(scenario), run)
+    end = RunEnd.of_reduced_records(scenario, buckets, last_tau_x, run.diverged_s)
+    return WholeRun(records, end, run)

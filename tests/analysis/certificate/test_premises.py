@@ -16,7 +16,7 @@ import pytest
 import trilat_net
 from tests.analysis.builders import EXPERT, make_run
 from tests.scenario.builders import make_overrides, rough_arm_text
-from trilat_net.analysis import decision_facts, run_end, run_remarks, stability_decision
+from trilat_net.analysis import run_end, run_remarks, stability_decision
 from trilat_net.analysis.certificate import (
     energy_balance,
     functional_judgements,
@@ -164,7 +164,6 @@ def list_clauses(module: ModuleType) -> set[str]:
 @pytest.mark.parametrize(
     "module",
     [
-        decision_facts,
         envelope_trend,
         functional_judgements,
         observed_energy,
@@ -197,9 +196,9 @@ def test_each_kind_of_facts_has_its_sentence() -> None:
 
 def test_each_name_of_a_decision_has_its_sentence() -> None:
     """Of a short record the decision itself states the length that would suffice."""
-    assert set(decision_text.BASES) == set(get_args(decision_facts.Basis))
+    assert set(decision_text.BASES) == set(get_args(stability_decision.Basis))
     obstacles = {*decision_text.OBSTACLES, "short record"}
-    assert obstacles == set(get_args(decision_facts.Obstacle))
+    assert obstacles == set(get_args(stability_decision.Obstacle))
     doubt_names = get_type_hints(run_end.EndDoubt)["name"]
     assert set(end_text.END_DOUBTS) == set(get_args(doubt_names))
 

@@ -25,8 +25,8 @@ from tests.log.surgery import take_apart
 from tests.scenario.builders import make_overrides
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.certificate.verdict_facts import StabilityFinding
-from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
 from trilat_net.scenario import parse_scenario

@@ -931,7 +931,7 @@ def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) 
 
 
 def _jump_alone(amount: Array) -> Increment:
-    """Describes an energy that is constant between ticks, and changes only by jumps.
+    """Returns the changes of an energy that is constant between ticks and changes by jumps.
 
     Such a jump occurs when a new message of another arm comes into use.
 

@@ -17,7 +17,6 @@ Invariant:
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from enum import Enum, auto
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -48,29 +47,13 @@ largest energy.
 """
 
 
-class ObservedFinding(Enum):
-    """Result of checking the energies that control laws declare, such as the energy of a tank.
+_Finding = Literal["passive", "negative", "broken", "not_judged"]
+"""Result of checking the energies that control laws declare, such as the energy of a tank.
 
-    The declared energy stays above zero if the law never returns more energy than it received.
-    The result is BROKEN if the declared energy does not match the recorded torques and
-    velocities, and NOT_JUDGED if the records are not sufficient.
-    """
-
-    PASSIVE = auto()
-    NEGATIVE = auto()
-    BROKEN = auto()
-    NOT_JUDGED = auto()
-
-    @property
-    def meaning(self) -> str:
-        """Explanation of the finding for the user, or an empty string if it needs none.
-
-        The package `presentation` provides the wording, which is the same wherever the finding
-        is explained.
-        """
-        return str(find_hook("describe a finding")(self))
-
-
+The declared energy stays above zero ("passive") if the law never returns more energy than it
+received. The result is "broken" if the declared energy does not match the recorded torques and
+velocities, and "not_judged" if the records are not sufficient.
+"""
 _EnergyKind = Literal["line", "known", "store", "taken", "given"]
 
 
@@ -171,7 +154,7 @@ class ObservedEnergy(NamedTuple):
             judged.
     """
 
-    finding: ObservedFinding
+    finding: _Finding
     premises: Sequence[Premise] = ()
     least: Sequence[_LeastEnergy] = ()
     largest_j: float = 0.0
@@ -193,7 +176,7 @@ class ObservedEnergy(NamedTuple):
         for figures.
         """
         return {
-            "finding": self.finding.name.lower(),
+            "finding": self.finding,
             "text": self.text,
             "premises": [premise.to_json() for premise in self.premises],
             "least": [least.to_json() for least in self.least],
@@ -226,7 +209,7 @@ class ObservedEnergy(NamedTuple):
         if not laws:
             return None
 
-        unjudged = ObservedFinding.NOT_JUDGED
+        unjudged: _Finding = "not_judged"
         undeclared_sites = [site for site in log.sites if site not in laws]
         if undeclared_sites:
             return ObservedEnergy(unjudged, undeclared_sites=tuple(undeclared_sites))
@@ -465,11 +448,11 @@ def _judge_books(log: Log, accounts: Mapping[str, _SiteBooks]) -> ObservedEnergy
     premises = _check_books(log, accounts, scale_j)
 
     lowest = min(least, key=lambda energy: energy.amount_j)
-    finding = ObservedFinding.PASSIVE
+    finding: _Finding = "passive"
     if not premises[0].holds:
-        finding = ObservedFinding.BROKEN
+        finding = "broken"
     elif lowest.amount_j < LEAST_ENERGY_J - ROUNDING_SHARE * scale_j:
-        finding = ObservedFinding.NEGATIVE
+        finding = "negative"
     return ObservedEnergy(
         finding=finding,
         premises=premises,

@@ -30,14 +30,13 @@ from ...core import Array
 from ...hooks import find_hook
 from ...log import MIN_COVERAGE, Log
 from ...results import JsonObject, Result, finite_or_none
-from ..decision_facts import Doubt, LoopRoots, RunFindings, StabilityDecision
 from ..run_end import EndBehaviour, RunEnd, Stability
 from ..run_remarks import RunCircumstances
-from ..stability_decision import decide_stability
+from ..stability_decision import Doubt, LoopRoots, RunFindings, StabilityDecision
 from ..twins.twin_growth import TwinGrowth
 from .energy_balance import EnergyBalance, SiteEnergy
 from .functional_judgements import JUDGEMENTS
-from .observed_energy import ObservedEnergy, ObservedFinding
+from .observed_energy import ObservedEnergy
 from .premise_quantities import Premise
 from .premises import RunFacts
 from .verdict_facts import (
@@ -47,7 +46,7 @@ from .verdict_facts import (
     StabilityVerdict,
 )
 
-_REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
+_REFUTING_FINDINGS = ("negative", "broken")
 
 
 @dataclass(frozen=True, repr=False)
@@ -239,7 +238,7 @@ class Certificate(Result):
             doubts=self._doubts,
             rises=self.verdict.finding is StabilityFinding.ROSE,
         )
-        return decide_stability(findings)
+        return findings.decide()
 
     @property
     def _is_covered(self) -> bool:
@@ -428,5 +427,5 @@ def _last_values(columns: dict[str, Array]) -> dict[str, float]:
 
 
 def _largest(values: Array) -> float:
-    """Returns the largest absolute value."""
+    """Returns the largest absolute value of an energy over time, in J."""
     return float(np.abs(values).max())

@@ -418,7 +418,7 @@ def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) 
 
 
 def _find_common_joint_names(scenario: Scenario) -> tuple[str, ...]:
-    """Returns the joints' names if the files of all arms have the same names, otherwise ()."""
+    """Returns the joint names that the files of all arms share, or () if the names differ."""
     all_names: set[tuple[str, ...]] = set()
     for site, arm in scenario.arms.items():
         has_file = bool(scenario.sites[site].arm.urdf)

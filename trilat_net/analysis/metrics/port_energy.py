@@ -200,7 +200,7 @@ def _measure_port_energy(view: RunView, site: str) -> MetricValues:
 
 
 def _measure_most(energy: Array) -> Metric:
-    """Returns the metric of the largest energy over time, in J, which is at least 0."""
+    """Returns the largest value of an energy over time as a metric, in J, but at least 0."""
     largest = float(energy.max())
     return Metric.of_value(max(0.0, largest))
 

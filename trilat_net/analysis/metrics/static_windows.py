@@ -533,10 +533,10 @@ def _weigh_load(
 
 
 def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bool]:
-    """Returns a sort key by which the site whose operator feels the torque comes last.
+    """Returns a sort key that puts the site whose operator feels the torque last.
 
-    That operator holds the arm like a spring at this time, and no environment acts at the site.
-    Among equal sites, masters come last.
+    The operator of this site holds the arm like a spring at the given time, and no environment
+    acts at the site. If this holds for several sites, masters come last.
 
     Args:
         scenario: Scenario of the run.

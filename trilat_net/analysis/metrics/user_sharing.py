@@ -283,7 +283,7 @@ def _measure_takeover_s(
     h_s: float,
     ramp_spans_s: list[tuple[float, float]],
 ) -> float:
-    """Returns how long it takes after a planned change of weights until another user leads.
+    """Returns the time from the start of a change of the weights to the change of the leader.
 
     The leader is the user whose arm the slave arm follows with the largest weight.
 

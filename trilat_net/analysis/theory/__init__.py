@@ -12,7 +12,7 @@ Invariant:
 """
 
 from .equilibrium import find_equilibrium
-from .linear_analysis import analyse_linear_loop
+from .linear_analysis import LinearAnalysis
 from .linear_edge import iterate_linear_edges
 
-__all__ = ["analyse_linear_loop", "find_equilibrium", "iterate_linear_edges"]
+__all__ = ["LinearAnalysis", "find_equilibrium", "iterate_linear_edges"]

@@ -24,7 +24,7 @@ from ...execution import FusedRun
 from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
 from ..run_end import EQUILIBRIUM_SPEED_RAD_S
-from . import linear_loop
+from .linear_loop import LinearLoop
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import (
@@ -121,7 +121,7 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
     Returns:
         Rates, one per state, shape (states,).
     """
-    arguments = linear_loop.gather_site_arguments(conditions, rest)
+    arguments = conditions.gather_site_arguments(rest)
     states = []
     for rates in conditions.evaluate_rates(arguments):
         velocities = np.zeros_like(rates.qdd)
@@ -135,7 +135,7 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
     The states of a site that are not part of the linear loop are the parameters of a law that
     does not learn.
     """
-    masks = linear_loop.mask_loop_states(conditions)
+    masks = conditions.mask_loop_states()
     pairs = zip(states, masks, strict=True)
     return np.concatenate([site_states[mask] for site_states, mask in pairs])
 
@@ -206,7 +206,7 @@ def _compute_gauss_newton_step(
     Velocities stay zero. States that cannot change also stay constant, such as an estimate
     without a gain or at a limit of its range. The shape is (states,).
     """
-    loop = linear_loop.LinearLoop.of_conditions(conditions, rest, all_estimates=True)
+    loop = LinearLoop.of_conditions(conditions, rest, all_estimates=True)
     delayed_matrices = [term.A for term in loop.delayed]
     effects = np.hstack([loop.A, *delayed_matrices])
 
@@ -234,7 +234,7 @@ def _shift_equilibrium(
 
     Velocities in the step are ignored, because all arms rest.
     """
-    masks = linear_loop.mask_loop_states(conditions)
+    masks = conditions.mask_loop_states()
     counts = [np.count_nonzero(mask) for mask in masks]
     ends = np.cumsum(counts)
     site_steps = np.split(step, ends[:-1])
@@ -280,7 +280,7 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
     Raises:
         ScenarioError: The pose of a site is singular, and the loop has no derivative there.
     """
-    arguments = linear_loop.gather_site_arguments(conditions, rest)
+    arguments = conditions.gather_site_arguments(rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         layout = ArgumentLayout.of_site(site)
         arm = place_arm(site, x[layout.q])
@@ -328,7 +328,7 @@ def _predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> 
 
     for _ in range(3):
         deviation = _compute_deviation(conditions, start, rest)
-        loop = linear_loop.LinearLoop.of_conditions(conditions, rest, all_estimates=True)
+        loop = LinearLoop.of_conditions(conditions, rest, all_estimates=True)
         remaining = _project_on_zero_roots(loop, deviation)
         if remaining is None:
             break
@@ -361,7 +361,7 @@ def _compute_deviation(
     return _select_loop_states(conditions, states)
 
 
-def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
+def _project_on_zero_roots(loop: LinearLoop, deviation: Array) -> Array | None:
     """Returns the part of an initial deviation that never decays, shape (states,).
 
     This part belongs to the roots at zero. `_predict_from_start` has the equation. The result
@@ -527,7 +527,7 @@ def _iterate_memories(
 ) -> Equilibrium:
     """Returns a pose with the memories of imported laws after some ticks in this pose."""
     theta_hat = rest.theta_hat.copy()
-    arguments = linear_loop.gather_site_arguments(conditions, rest)
+    arguments = conditions.gather_site_arguments(rest)
     for n, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
         if isinstance(site.law_factory, NumericLaw):
             memory = site.law_factory.iterate_memory(x, ticks)
@@ -649,7 +649,7 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
     equal_alpha = np.full((count, count), 1.0 / count)
     equal_shares = conditions._replace(alpha=equal_alpha)
     start = Equilibrium(q, q, "", 0.0)
-    references = linear_loop.compute_references(equal_shares, start)
+    references = equal_shares.compute_references(start)
     return tuple(references[0].tolist())
 
 
@@ -738,7 +738,7 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
             f"{rest.residual:.2g} remain, and the roots are those of equations frozen at it"
         )
 
-    arguments = linear_loop.gather_site_arguments(conditions, rest)
+    arguments = conditions.gather_site_arguments(rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         if site.chain is None or site.chain.task is None:
             continue

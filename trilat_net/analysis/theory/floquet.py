@@ -740,7 +740,7 @@ def _find_multipliers(
 ) -> tuple[Complex, Complex, NDArray[np.bool_]]:
     """Returns the largest multipliers of a span map, by the block Arnoldi method.
 
-    The method applies the map again and again, each time to the block of columns that the last
+    The method applies the map repeatedly, each time to the block of columns that the last
     application added, and keeps an orthonormal basis of all columns so far. The eigenvalues of
     the small matrix H, which is the map in this basis, approach the largest multipliers. The
     method ends when all wanted multipliers are exact, when no new direction is found, or when
@@ -818,33 +818,6 @@ def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
     return selected
 
 
-def compute_sampled_spectrum(
-    conditions: OperatingConditions,
-    rest: Equilibrium,
-    wanted: int = 6,
-    uses: SamplesInUse | None = None,
-) -> Spectrum | None:
-    """Computes the rightmost characteristic roots of coupled arms with sampled controllers.
-
-    A small motion is followed over a span of T seconds, after which the pattern of delays and
-    ticks repeats. This gives a linear map of the states. Each eigenvalue z of the map
-    corresponds to a root s with z = exp(s T).
-
-    Args:
-        conditions: The sites, gains and delays.
-        rest: The equilibrium about which the loop is linearised.
-        wanted: Number of roots. Fewer are returned if the others are too close to -infinity.
-        uses: The samples of the other sites that each site uses. If `None`, they are derived
-            from the links.
-
-    Returns:
-        The roots, or `None` if a control law can only be linearised in continuous time.
-    """
-    if conditions.has_forms:
-        return None
-    return SampledLoop(conditions, uses).compute_spectrum(rest, wanted)
-
-
 class SampledLoop:
     """Linear model of coupled arms whose controllers act in ticks, for several equilibria.
 
@@ -868,15 +841,17 @@ class SampledLoop:
         self._modes: Array | None = None
 
     @limit_blas_threads()
-    def compute_spectrum(self, rest: Equilibrium, wanted: int) -> Spectrum:
+    def compute_spectrum(self, rest: Equilibrium, wanted: int = 6) -> Spectrum:
         """Computes the fastest growing (rightmost) roots of small motions about an equilibrium.
 
-        The control loops are linearised including their ticks and delays (see
-        `compute_sampled_spectrum`).
+        A small motion is followed over a span of T seconds, after which the pattern of delays
+        and ticks repeats. This gives a linear map of the states. Each eigenvalue z of the map
+        corresponds to a root s with z = exp(s T).
 
         Args:
-            rest: The equilibrium.
-            wanted: Number of roots.
+            rest: The equilibrium about which the loop is linearised.
+            wanted: Number of roots. Fewer are returned if the others are too close to
+                -infinity.
         """
         uses = self._uses
         span_s: float | None = uses.period_s or uses.span_s

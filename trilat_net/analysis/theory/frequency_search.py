@@ -175,11 +175,15 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
     return 1.0 / (8.0 * delay_s * relative_step)
 
 
-def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
+def refine_response(response: PortResponse, w_rad_s: Array) -> tuple[Array, PortResponse]:
     """Adds frequencies until a response changes little from one frequency to the next.
 
     The relative change is at most a tenth. The number of points is limited. At a pole on the
     imaginary axis, refinement stops when two points differ by a millionth.
+
+    Several analyses evaluate the response at the refined frequencies. The returned response
+    therefore has cached values there. They are returned only when the function is called with
+    the very array of the refined frequencies.
 
     Args:
         response: The response as a function of frequency.
@@ -187,6 +191,7 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
 
     Returns:
         All frequencies in ascending order, in rad/s.
+        The response with cached values at these frequencies.
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
@@ -202,8 +207,12 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
         is_large: NDArray[np.bool_] = change > _CHANGE * reference
         return is_large
 
-    refined, _ = _refine(response, w_rad_s, find_large_changes)
-    return refined
+    refined, values = _refine(response, w_rad_s, find_large_changes)
+
+    def evaluate(w: Array) -> Complex:
+        return values if w is refined else response(w)
+
+    return refined, evaluate
 
 
 def _refine(
@@ -243,25 +252,6 @@ def _refine(
         middle_values = function(middles)
         values = np.insert(values, indices, middle_values, axis=0)
     return w_rad_s, values
-
-
-def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
-    """Returns a frequency response whose values at given frequencies are cached.
-
-    Several analyses evaluate the response at the same frequencies, which are then computed only
-    once. The cached values are returned only when the function is called with this very array
-    object.
-
-    Args:
-        response: The function of frequency.
-        w_rad_s: The frequencies, shape (F,), in rad/s.
-    """
-    cached = response(w_rad_s)
-
-    def evaluate(w: Array) -> Complex:
-        return cached if w is w_rad_s else response(w)
-
-    return evaluate
 
 
 def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:

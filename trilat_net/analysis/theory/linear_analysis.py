@@ -1,6 +1,6 @@
 """Predicts whether small motions of coupled arms decay, for a scenario or a log.
 
-`analyse_linear_loop` implements the command `trilat linear`. It linearises the control loop
+`LinearAnalysis.compute` implements the command `trilat linear`. It linearises the control loop
 about an equilibrium, a pose in which all arms are at rest, and computes its characteristic
 roots: the loop is stable if all roots have a negative real part. The roots are computed for the
 sampled loop, whose controllers act once per tick, and for its continuous approximation. The
@@ -35,13 +35,14 @@ from ...results import Result
 from ...scenario import IRREVERSIBLE_SHARES, Scenario, load_scenario
 from ..blas_threads import limit_blas_threads
 from ..stability_decision import NEAR_REST_RAD
+from ..timeline import Timeline
 from .characteristic_roots import CharacteristicRoot, Spectrum
 from .delay_margin import DelayMargin
 from .equilibrium import add_limit_notes, find_equilibrium
-from .floquet import SamplesInUse, compute_sampled_spectrum
-from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
-from .linear_loop import LinearLoop, compute_shared_poses
-from .loop_roots import EndLoop, resolve_final_scenario
+from .floquet import SampledLoop, SamplesInUse
+from .linear_edge import EdgeScan
+from .linear_loop import LinearLoop
+from .loop_roots import EndLoop
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
 from .port_analysis import PortAnalysis
@@ -59,7 +60,7 @@ abs(s).
 
 @dataclass(frozen=True, repr=False)
 class LinearAnalysis(Result):
-    """Result of the linear stability analysis of coupled arms (see `analyse_linear_loop`).
+    """Result of the linear stability analysis of coupled arms (see `LinearAnalysis.compute`).
 
     The arms are linearised about an equilibrium. The roots of the loop show whether small
     motions about it decay, and for which network delays.
@@ -94,6 +95,75 @@ class LinearAnalysis(Result):
     ports: PortAnalysis | None = None
     distance_rad: float | None = None
 
+    @classmethod
+    @limit_blas_threads()
+    def compute(
+        cls,
+        source: str | Path | Scenario | Log,
+        overrides: Mapping[str, Any] | Sequence[str] = (),
+        *,
+        pose: tuple[float, ...] | None = None,
+        roots: int = DEFAULT_ROOTS,
+        over: Sequence[str] = (),
+        ports: bool = False,
+        operators: Sequence[str | Path] = (),
+    ) -> "LinearAnalysis":
+        """Predicts whether small motions of the coupled arms of a scenario decay.
+
+        The control loop is linearised about a pose in which all arms are at rest.
+
+        Args:
+            source: A scenario, its file, the name of a shipped scenario, or the log of a run.
+            overrides: Settings of the scenario to replace. If there are any, only the scenario
+                of a log is used, not its records.
+            pose: Pose at rest that all arms share, in rad. If `None`, the final pose of a run
+                is used.
+            roots: Number of characteristic roots to compute.
+            over: Ranges of settings in which to search for the values at which stability
+                changes, such as "control.d=0.1:3".
+            ports: True to also analyse what operators feel when they hold an arm.
+            operators: Files of measured operators, from `trilat identify hand --json`. Any of
+                them may hold the arm of any master.
+
+        Raises:
+            ScenarioError: The scenario is invalid, or cannot be linearised.
+            UsageError: Another argument is invalid.
+        """
+        hands = [HandMatrices.read(Path(file)) for file in operators]
+        ranges = [EdgeScan.parse(text) for text in over]
+        if not 1 <= roots <= MAX_ROOTS:
+            raise UsageError(f"--roots must be from 1 to {MAX_ROOTS}, not {roots}")
+
+        scenario = load_scenario(source, overrides)
+        if pose is None:
+            log = source if isinstance(source, Log) and not overrides else None
+            analysed = _find_end_loop(scenario, log)
+        else:
+            conditions = OperatingConditions.derive(scenario)
+            analysed = _AnalysedLoop(scenario, conditions, find_equilibrium(scenario, pose))
+        scenario = analysed.scenario
+        conditions = analysed.conditions
+        rest = analysed.rest
+        loop = LinearLoop.of_conditions(conditions, rest)
+
+        sampled = None
+        if not conditions.has_forms:
+            sampled = SampledLoop(conditions, analysed.uses).compute_spectrum(rest, roots)
+        analysis = cls(
+            scenario=scenario,
+            conditions=conditions,
+            rest=rest,
+            loop=loop,
+            continuous=Spectrum.of_loop(loop, roots),
+            sampled=sampled,
+            margin=DelayMargin.of_loop(loop),
+            distance_rad=analysed.distance_rad,
+        )
+
+        scans = [edge_range.scan(scenario, rest) for edge_range in ranges]
+        port_analysis = PortAnalysis.of_scenario(scenario, rest, hands=hands) if ports else None
+        return replace(analysis, scans=tuple(scans), ports=port_analysis)
+
     @property
     def end_effectors(self) -> tuple[Array, ...]:
         """Pose of each arm's end effector at rest, if the arms follow with their end effectors.
@@ -103,7 +173,7 @@ class LinearAnalysis(Result):
         sites = self.conditions.sites
         if not sites[0].layout.task:
             return (np.zeros(0),) * len(sites)
-        return tuple(compute_shared_poses(self.conditions, self.rest))
+        return tuple(self.conditions.compute_shared_poses(self.rest))
 
     @property
     def decisive(self) -> Spectrum:
@@ -306,7 +376,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
     conditions = OperatingConditions.derive(scenario)
     try:
         if log is not None:
-            scenario = resolve_final_scenario(log)
+            scenario = Timeline(log).final_scenario
             end = EndLoop.of_log(log, own_laws=True)
         else:
             run = FusedRun(scenario)
@@ -322,74 +392,6 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
         conditions = conditions._replace(age_s=end.conditions.age_s)
     rest = add_limit_notes(conditions, end.rest)
     return _AnalysedLoop(scenario, conditions, rest, end.uses, end.distance_rad)
-
-
-@limit_blas_threads()
-def analyse_linear_loop(
-    source: str | Path | Scenario | Log,
-    overrides: Mapping[str, Any] | Sequence[str] = (),
-    *,
-    pose: tuple[float, ...] | None = None,
-    roots: int = DEFAULT_ROOTS,
-    over: Sequence[str] = (),
-    ports: bool = False,
-    operators: Sequence[str | Path] = (),
-) -> LinearAnalysis:
-    """Predicts whether small motions of the coupled arms of a scenario decay.
-
-    The control loop is linearised about a pose in which all arms are at rest.
-
-    Args:
-        source: A scenario, its file, the name of a shipped scenario, or the log of a run.
-        overrides: Settings of the scenario to replace. If there are any, only the scenario of a
-            log is used, not its records.
-        pose: Pose at rest that all arms share, in rad. If `None`, the final pose of a run is
-            used.
-        roots: Number of characteristic roots to compute.
-        over: Ranges of settings in which to search for the values at which stability changes,
-            such as "control.d=0.1:3".
-        ports: True to also analyse what operators feel when they hold an arm.
-        operators: Files of measured operators, from `trilat identify hand --json`. Any of them
-            may hold the arm of any master.
-
-    Raises:
-        ScenarioError: The scenario is invalid, or cannot be linearised.
-        UsageError: Another argument is invalid.
-    """
-    hands = [HandMatrices.read(Path(file)) for file in operators]
-    ranges = [parse_edge_range(text) for text in over]
-    if not 1 <= roots <= MAX_ROOTS:
-        raise UsageError(f"--roots must be from 1 to {MAX_ROOTS}, not {roots}")
-
-    scenario = load_scenario(source, overrides)
-    if pose is None:
-        log = source if isinstance(source, Log) and not overrides else None
-        analysed = _find_end_loop(scenario, log)
-    else:
-        conditions = OperatingConditions.derive(scenario)
-        analysed = _AnalysedLoop(scenario, conditions, find_equilibrium(scenario, pose))
-    scenario = analysed.scenario
-    conditions = analysed.conditions
-    rest = analysed.rest
-    loop = LinearLoop.of_conditions(conditions, rest)
-
-    analysis = LinearAnalysis(
-        scenario=scenario,
-        conditions=conditions,
-        rest=rest,
-        loop=loop,
-        continuous=Spectrum.of_loop(loop, roots),
-        sampled=compute_sampled_spectrum(conditions, rest, roots, analysed.uses),
-        margin=DelayMargin.of_loop(loop),
-        distance_rad=analysed.distance_rad,
-    )
-
-    scans = []
-    for key, low, high in ranges:
-        edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
-        scans.append(EdgeScan(key, low, high, tuple(edges)))
-    port_analysis = PortAnalysis.of_scenario(scenario, rest, hands=hands) if ports else None
-    return replace(analysis, scans=tuple(scans), ports=port_analysis)
 
 
 def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:

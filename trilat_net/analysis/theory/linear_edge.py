@@ -36,7 +36,7 @@ from .equilibrium import (
     find_mean_pose,
     follow_equilibrium,
 )
-from .floquet import compute_sampled_spectrum
+from .floquet import SampledLoop
 from .linear_loop import LinearLoop
 from .operating_point import Equilibrium, OperatingConditions
 from .site_dynamics import place_arm
@@ -85,10 +85,9 @@ def find_rightmost_root(
     Returns:
         The root, or `None` if all roots are zero.
     """
-    spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
-    if spectrum is None:
-        spectrum = Spectrum.of_loop(LinearLoop.of_conditions(conditions, rest), 1)
-    return spectrum.rightmost
+    if sampled and not conditions.has_forms:
+        return SampledLoop(conditions).compute_spectrum(rest, 1).rightmost
+    return Spectrum.of_loop(LinearLoop.of_conditions(conditions, rest), 1).rightmost
 
 
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
@@ -181,31 +180,42 @@ class EdgeScan(NamedTuple):
         key: Key of the scenario, such as "control.d".
         low: Lower end of the scanned range.
         high: Upper end of the scanned range.
-        edges: The values in ascending order, with the roots that cross there.
+        edges: The values in ascending order, with the roots that cross there. Empty before the
+            range was scanned.
     """
 
     key: str
     low: float
     high: float
-    edges: tuple[LinearEdge, ...]
+    edges: tuple[LinearEdge, ...] = ()
 
+    @classmethod
+    def parse(cls, text: str) -> "EdgeScan":
+        """Parses a setting and the range of values in which to search for a stability limit.
 
-def parse_edge_range(text: str) -> tuple[str, float, float]:
-    """Parses a setting and the range of values in which to search for a stability limit.
+        Args:
+            text: The string to parse, for example "control.d=0.1:3".
+        """
+        key, _, ends = text.partition("=")
+        low, colon, high = ends.partition(":")
+        try:
+            if not key.strip() or not colon:
+                raise ValueError
+            return cls(key.strip(), float(low), float(high))
+        except ValueError:
+            raise UsageError(
+                f"--over must have the form KEY=LOW:HIGH, as in control.d=0.1:3, not {text!r}"
+            ) from None
 
-    Args:
-        text: The string to parse, for example "control.d=0.1:3".
-    """
-    key, _, ends = text.partition("=")
-    low, colon, high = ends.partition(":")
-    try:
-        if not key.strip() or not colon:
-            raise ValueError
-        return key.strip(), float(low), float(high)
-    except ValueError:
-        raise UsageError(
-            f"--over must have the form KEY=LOW:HIGH, as in control.d=0.1:3, not {text!r}"
-        ) from None
+    def scan(self, scenario: Scenario, rest: Equilibrium) -> "EdgeScan":
+        """Returns this range with the values at which the arms become stable or unstable.
+
+        Args:
+            scenario: The scenario.
+            rest: Equilibrium of the scenario.
+        """
+        edges = iterate_linear_edges(scenario, self.key, self.low, self.high, rest)
+        return self._replace(edges=tuple(edges))
 
 
 def iterate_linear_edges(

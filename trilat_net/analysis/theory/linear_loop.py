@@ -26,10 +26,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from ...core import POSITION, Array, SiteSetup
+from ...errors import UsageError
 from ...laws import BlockKey, LinearForm
 from . import site_dynamics
 from .numeric_law import NumericLaw
@@ -96,7 +96,7 @@ class SiteJacobian(NamedTuple):
         Returns:
             The models, in the order of the sites.
         """
-        arguments = gather_site_arguments(conditions, rest)
+        arguments = conditions.gather_site_arguments(rest)
         references = _differentiate_references(conditions, rest)
         jacobians = []
         for i, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
@@ -209,6 +209,155 @@ class LinearLoop(NamedTuple):
         term = DelayedTerm(delay_s, delayed_A, delayed_B)
         return self._replace(delayed=(term,))
 
+    @property
+    def port_sites(self) -> tuple[str, ...]:
+        """Site of each input, for example "m1" for the joint torque "m1.tau2"."""
+        return tuple(name.partition(".")[0] for name in self.inputs)
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """Names of the sites whose joints have inputs, in the order of their first inputs."""
+        # a dict keeps each site once, in order
+        return tuple(dict.fromkeys(self.port_sites))
+
+    @property
+    def port_joints(self) -> tuple[int, ...]:
+        """Joint number of each input, for example 2 for the joint torque "m1.tau2"."""
+        return tuple(int(name.rpartition("tau")[2]) for name in self.inputs)
+
+    @property
+    def ports_by_joint(self) -> dict[int, list[int]]:
+        """Indices of the inputs of each joint number, in the order of the sites.
+
+        The first joints of all arms, for example, can then be analysed together, excluding the
+        other joints.
+        """
+        ports: dict[int, list[int]] = {}
+        for port, joint in enumerate(self.port_joints):
+            ports.setdefault(joint, []).append(port)
+        return dict(sorted(ports.items()))
+
+    def find_site_ports(self, site: str) -> list[int]:
+        """Finds the ports of an arm, the joints at which its operator pushes.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            Indices of the ports among the inputs of the loop.
+
+        Raises:
+            UsageError: The loop has no such site.
+        """
+        ports = [n for n, port_site in enumerate(self.port_sites) if port_site == site]
+        if not ports:
+            sites = ", ".join(self.sites)
+            raise UsageError(
+                f"there is no site {site!r} among the ports; the sites are {sites}"
+            )
+        return ports
+
+    def clamp_site(self, site: str) -> "LinearLoop":
+        """Returns the linear model of the arms with one arm held still by a clamp.
+
+        The torque u_c of the clamp makes the arm's accelerations zero: u_c = -B_cc^-1 (A_c x +
+        B_c u + delayed terms), where x is the state, u the other torques, A_c and B_c the rows
+        of the loop's matrices for these accelerations, and B_cc the part of B_c that belongs to
+        the arm's own torques. The torque acts wherever the law uses the torque of this arm.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The loop excluding the ports, velocities and angles of the site.
+
+        Raises:
+            UsageError: There is no such site, or two clamped sites reflect force onto each
+                other.
+        """
+        ports = self.find_site_ports(site)
+        other_ports = [n for n in range(len(self.inputs)) if n not in ports]
+        speeds = []
+        angles = []
+        for port in ports:
+            speed_name = self.outputs[port]
+            angle_name = self.inputs[port].replace(".tau", ".q")
+            speeds.append(self.names.index(speed_name))
+            angles.append(self.names.index(angle_name))
+        removed = {*speeds, *angles}
+        kept_states = [n for n in range(len(self.names)) if n not in removed]
+        undelayed_term = DelayedTerm(0.0, self.A, self.B)
+        terms = [undelayed_term, *self.delayed]
+        acceleration_block = np.ix_(speeds, ports)
+        for term in self.delayed:
+            reflected_torque = term.B[acceleration_block]
+            if reflected_torque.any():
+                raise UsageError(
+                    "clamped sites that reflect force onto each other do not have a finite "
+                    f"response: {site}"
+                )
+        # the torque of the clamp as a sum of terms with delays
+        inverse_inertia = self.B[acceleration_block]
+        inertia = np.linalg.inv(inverse_inertia)
+        sums: dict[float, DelayedTerm] = {}
+
+        def add_term(delay_s: float, A: Array, B: Array) -> None:
+            """Adds matrices to the part of the model that acts after a given delay.
+
+            Delays that differ only by rounding errors are considered equal.
+
+            Args:
+                delay_s: The delay, in s.
+                A: Effect of the delayed states.
+                B: Effect of the delayed torques.
+            """
+            key = round(delay_s, 12)
+            if key in sums:
+                previous = sums[key]
+                A = previous.A + A
+                B = previous.B + B
+            sums[key] = DelayedTerm(key, A, B)
+
+        clamp_torques = []
+        for term in terms:
+            by_state = term.A[speeds]
+            by_torque = term.B[speeds][:, other_ports]
+            clamp_by_state = -inertia @ by_state
+            clamp_by_torque = -inertia @ by_torque
+            clamp = DelayedTerm(term.delay_s, clamp_by_state, clamp_by_torque)
+            clamp_torques.append(clamp)
+        for term in terms:
+            other_effect = term.B[:, other_ports]
+            add_term(term.delay_s, term.A, other_effect)
+            effect = term.B[:, ports]
+            if not effect.any():
+                continue
+            for clamp in clamp_torques:
+                delay_s = term.delay_s + clamp.delay_s
+                effect_of_state = effect @ clamp.A
+                effect_of_torque = effect @ clamp.B
+                add_term(delay_s, effect_of_state, effect_of_torque)
+        kept_terms = []
+        kept_block = np.ix_(kept_states, kept_states)
+        for delay_s in sorted(sums):
+            total = sums[delay_s]
+            kept_A = total.A[kept_block]
+            kept_B = total.B[kept_states]
+            kept_term = DelayedTerm(delay_s, kept_A, kept_B)
+            kept_terms.append(kept_term)
+        undelayed, *delayed = kept_terms
+        active_terms = [term for term in delayed if term.A.any() or term.B.any()]
+        return LinearLoop(
+            names=tuple(self.names[n] for n in kept_states),
+            inputs=tuple(self.inputs[n] for n in other_ports),
+            outputs=tuple(self.outputs[n] for n in other_ports),
+            A=undelayed.A,
+            B=undelayed.B,
+            C=self.C[np.ix_(other_ports, kept_states)],
+            delayed=tuple(active_terms),
+            E=None if self.E is None else self.E[kept_states],
+        )
+
     @classmethod
     def of_conditions(
         cls,
@@ -311,92 +460,6 @@ def join_diagonal_blocks(blocks: Sequence[Array]) -> Array:
     return matrix
 
 
-def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Collects the states and inputs of each site when all arms are at rest.
-
-    The states are joint angles, joint velocities and parameter estimates. The inputs are the
-    values that a site receives from the other sites, and the external torque. `ArgumentLayout`
-    defines their order.
-
-    Args:
-        conditions: The sites, gains and delays of the coupled arms.
-        rest: The equilibrium, with the parameter estimates.
-
-    Returns:
-        One vector per site, with the length stated by its `ArgumentLayout`.
-    """
-    layouts = [site_dynamics.ArgumentLayout.of_site(site) for site in conditions.sites]
-    arguments = [np.zeros(layout.arguments) for layout in layouts]
-    references = compute_references(conditions, rest)
-    site_arguments = list(zip(layouts, arguments, strict=True))
-    for i, (layout, x) in enumerate(site_arguments):
-        q = rest.q[i]
-        theta_hat = rest.theta_hat[i]
-        x[layout.q] = q[: layout.joints]
-        x[layout.estimate] = theta_hat[: layout.parameters]
-        x[layout.q_des] = references[i]
-
-    # the peers' torques follow from the arguments so far
-    reflected = [
-        site_dynamics.compute_reflected_torque(site, x)
-        for site, x in zip(conditions.sites, arguments, strict=True)
-    ]
-    peer_torques = conditions.alpha @ reflected
-    for i, (layout, x) in enumerate(site_arguments):
-        x[layout.peer_torque] = peer_torques[i]
-        peers = [j for j in range(len(arguments)) if j != i]
-        m = layout.coordinates
-        qd = np.zeros(m)
-        for index in range(layout.peers):
-            j = peers[index]
-            q = rest.q[j]
-            torque = -reflected[j]
-            sample = layout.peer_sample(index)
-            x[sample] = np.concatenate([q[:m], qd, torque])
-    return arguments
-
-
-def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that each arm sends to the other arms while all of them are at rest.
-
-    The pose consists of the joint angles, or in task space of the pose of the end effector.
-
-    Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium.
-
-    Returns:
-        One pose per site, shape (m,).
-    """
-    poses = []
-    for site, q in zip(conditions.sites, rest.q, strict=True):
-        joint_positions = q[: site.layout.joints]
-        pose = site_dynamics.compute_shared_pose(site, joint_positions)
-        poses.append(pose)
-    return poses
-
-
-def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Computes the pose that the control law of each arm tries to reach at rest.
-
-    This pose, the reference, is the mean of the other arms' poses, weighted with the dominance
-    factors.
-
-    Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium.
-
-    Returns:
-        One reference per site, shape (m,).
-    """
-    poses = compute_shared_poses(conditions, rest)
-    if not conditions.sites[0].layout.task:
-        references = conditions.alpha @ np.array(poses)
-        return list(references)
-    pairs = zip(conditions.alpha, poses, strict=True)
-    return [evaluate_reference(shares, pose, poses) for shares, pose in pairs]
-
-
 def _differentiate_references(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> dict[tuple[int, int], Array]:
@@ -416,7 +479,7 @@ def _differentiate_references(
         missing.
     """
     derivatives = {}
-    poses = compute_shared_poses(conditions, rest)
+    poses = conditions.compute_shared_poses(rest)
     for i, shares in enumerate(conditions.alpha):
         followed = np.flatnonzero(shares).tolist()
         m = len(poses[i])
@@ -484,28 +547,6 @@ def compute_couplings(
             coupling = np.vstack([coupling, *samples])
         couplings[i, j] = coupling
     return couplings
-
-
-def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
-    """Finds which states of each site belong to the linear model of the coupled arms.
-
-    Joint angles and velocities always belong to the model. The parameter estimates, or the
-    memory of a user's control law, belong to it if the control law changes them.
-
-    Args:
-        conditions: The sites and their control laws.
-
-    Returns:
-        For each site, a boolean mask over its states (angles, velocities, estimates), shape
-        (states,).
-    """
-    masks = []
-    for site in conditions.sites:
-        layout = site_dynamics.ArgumentLayout.of_site(site)
-        mask = np.ones(layout.states, dtype=bool)
-        mask[layout.estimate] = site_dynamics.has_estimate(site)
-        masks.append(mask)
-    return masks
 
 
 def _select_states(

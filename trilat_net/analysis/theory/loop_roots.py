@@ -39,10 +39,9 @@ from ...log import Ints, Log
 from ...records import NS_PER_S, Mode
 from ...scenario import Scenario
 from ..blas_threads import limit_blas_threads
-from ..decision_facts import LoopRoots
-from ..delay_period import find_final_link
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace
 from ..shared_slave import list_program_sites
+from ..stability_decision import LoopRoots
 from ..timeline import Timeline
 from .characteristic_roots import Spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
@@ -135,7 +134,7 @@ class EndLoop(NamedTuple):
             return used
 
         last_ticks = [int(site_log.tick[-1]) for site_log in site_logs]
-        final = _fix_delays(resolve_final_scenario(log), last_ticks, read_used_samples)
+        final = _fix_delays(Timeline(log).final_scenario, last_ticks, read_used_samples)
         trace = RunTrace.of_log(log)
         state = None
         if _has_sampled_wall(final.scenario):
@@ -193,7 +192,7 @@ class EndLoop(NamedTuple):
             return samples
 
         final = _fix_delays(ended, last_ticks, draw_samples)
-        trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
+        trace = RunTrace.of_run(run)
         state = None
         if _has_sampled_wall(ended):
             state = _find_state_in_wall(ended, _record_motions(ended))
@@ -268,21 +267,6 @@ def _check_mode(site: str, mode: str, source: str) -> None:
         raise ScenarioError(f"{site} ends in the mode {mode!r}", source=source)
 
 
-def resolve_final_scenario(log: Log) -> Scenario:
-    """Returns the scenario of a log, with the users' commands of the run as planned changes.
-
-    Its duration is the recorded duration. The settings in effect at its end are therefore those
-    of the final control loop.
-
-    Args:
-        log: The log of the run.
-    """
-    run = Timeline(log)
-    commands = [change for change in run.effective_commands if not change.order]
-    timeline = sorted([*log.scenario.timeline, *commands], key=lambda change: change.at_s)
-    return msgspec.structs.replace(log.scenario, timeline=tuple(timeline), duration_s=run.end_s)
-
-
 class _FixedDelays(NamedTuple):
     """A scenario in which the delay of every network link is known at every time.
 
@@ -303,7 +287,7 @@ class _FixedDelays(NamedTuple):
 
 
 class _EndState(NamedTuple):
-    """Poses of all arms at the end of a run, near which to search for a pose of rest.
+    """Poses of all arms at the end of a run, from which the search for a pose of rest starts.
 
     Attributes:
         q: Joint angles, shape (N, n), in rad.
@@ -451,11 +435,10 @@ def _end_traces(scenario: Scenario) -> Scenario:
     end_us = 1e6 * scenario.duration_s
     last_delays_ms = {}
     for name in scenario.links:
-        link = find_final_link(scenario, name)
+        link = scenario.find_final_link(name)
         points = link.points
-        if not link.has_ending_trace or points is None or not points[-1, 0] <= end_us:
-            continue
-        last_delays_ms[name] = 1e-3 * float(points[-1, 1])
+        if link.has_ending_trace and points is not None and points[-1, 0] <= end_us:
+            last_delays_ms[name] = 1e-3 * float(points[-1, 1])
     return scenario.with_constant_delays(last_delays_ms)
 
 
@@ -467,7 +450,7 @@ def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
     """
     has_unknown_delay = {}
     for name in scenario.links:
-        link = find_final_link(scenario, name)
+        link = scenario.find_final_link(name)
         has_unknown_delay[name] = link.random or link.measured or link.has_ending_trace
     return has_unknown_delay
 

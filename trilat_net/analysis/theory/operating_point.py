@@ -20,6 +20,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core import (
     LIVE_KINDS,
@@ -37,13 +38,16 @@ from ...files import find_page
 from ...laws import LinearForm
 from ...records import NS_PER_S
 from ...scenario import LinkBase, Scenario
-from ..delay_period import (
-    MAX_PERIOD_TICKS,
-    find_final_link,
-    find_link_period_s,
-)
+from ..delay_period import MAX_PERIOD_TICKS
 from .numeric_law import NumericLaw
-from .site_dynamics import SiteRates
+from .site_dynamics import (
+    ArgumentLayout,
+    SiteRates,
+    compute_reflected_torque,
+    compute_shared_pose,
+    has_estimate,
+)
+from .textbook_arm import evaluate_reference
 
 
 class Equilibrium(NamedTuple):
@@ -200,6 +204,104 @@ class OperatingConditions(NamedTuple):
         """
         pairs = zip(self.sites, arguments, strict=True)
         return [SiteRates.evaluate(site, x) for site, x in pairs]
+
+    def gather_site_arguments(self, rest: Equilibrium) -> list[Array]:
+        """Collects the states and inputs of each site when all arms are at rest.
+
+        The states are joint angles, joint velocities and parameter estimates. The inputs are
+        the values that a site receives from the other sites, and the external torque.
+        `ArgumentLayout` defines their order.
+
+        Args:
+            rest: The equilibrium, with the parameter estimates.
+
+        Returns:
+            One vector per site, with the length stated by its `ArgumentLayout`.
+        """
+        layouts = [ArgumentLayout.of_site(site) for site in self.sites]
+        arguments = [np.zeros(layout.arguments) for layout in layouts]
+        references = self.compute_references(rest)
+        site_arguments = list(zip(layouts, arguments, strict=True))
+        for i, (layout, x) in enumerate(site_arguments):
+            q = rest.q[i]
+            theta_hat = rest.theta_hat[i]
+            x[layout.q] = q[: layout.joints]
+            x[layout.estimate] = theta_hat[: layout.parameters]
+            x[layout.q_des] = references[i]
+
+        # the peers' torques follow from the arguments so far
+        reflected = [
+            compute_reflected_torque(site, x)
+            for site, x in zip(self.sites, arguments, strict=True)
+        ]
+        peer_torques = self.alpha @ reflected
+        for i, (layout, x) in enumerate(site_arguments):
+            x[layout.peer_torque] = peer_torques[i]
+            peers = [j for j in range(len(arguments)) if j != i]
+            m = layout.coordinates
+            qd = np.zeros(m)
+            for index in range(layout.peers):
+                j = peers[index]
+                q = rest.q[j]
+                torque = -reflected[j]
+                sample = layout.peer_sample(index)
+                x[sample] = np.concatenate([q[:m], qd, torque])
+        return arguments
+
+    def compute_shared_poses(self, rest: Equilibrium) -> list[Array]:
+        """Computes the pose that each arm sends to the other arms while all arms are at rest.
+
+        The pose consists of the joint angles, or in task space of the pose of the end effector.
+
+        Args:
+            rest: The equilibrium.
+
+        Returns:
+            One pose per site, shape (m,).
+        """
+        poses = []
+        for site, q in zip(self.sites, rest.q, strict=True):
+            joint_positions = q[: site.layout.joints]
+            pose = compute_shared_pose(site, joint_positions)
+            poses.append(pose)
+        return poses
+
+    def compute_references(self, rest: Equilibrium) -> list[Array]:
+        """Computes the pose that the control law of each arm tries to reach at rest.
+
+        This pose, the reference, is the mean of the other arms' poses, weighted with the
+        dominance factors.
+
+        Args:
+            rest: The equilibrium.
+
+        Returns:
+            One reference per site, shape (m,).
+        """
+        poses = self.compute_shared_poses(rest)
+        if not self.sites[0].layout.task:
+            references = self.alpha @ np.array(poses)
+            return list(references)
+        pairs = zip(self.alpha, poses, strict=True)
+        return [evaluate_reference(shares, pose, poses) for shares, pose in pairs]
+
+    def mask_loop_states(self) -> list[NDArray[np.bool_]]:
+        """Finds which states of each site belong to the linear model of the coupled arms.
+
+        Joint angles and velocities always belong to the model. The parameter estimates, or the
+        memory of a user's control law, belong to it if the control law changes them.
+
+        Returns:
+            For each site, a boolean mask over its states (angles, velocities, estimates), shape
+            (states,).
+        """
+        masks = []
+        for site in self.sites:
+            layout = ArgumentLayout.of_site(site)
+            mask = np.ones(layout.states, dtype=bool)
+            mask[layout.estimate] = has_estimate(site)
+            masks.append(mask)
+        return masks
 
     @classmethod
     def derive(cls, scenario: Scenario, *, own_laws: bool = True) -> "OperatingConditions":
@@ -382,7 +484,7 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
     Raises:
         ScenarioError: The delay of the link is measured during the run, and unknown before.
     """
-    link = find_final_link(scenario, name)
+    link = scenario.find_final_link(name)
     if link.measured:
         raise ScenarioError(
             "must not be 'measured', because the delay of a measured link is not known "
@@ -402,8 +504,8 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
 
 def _has_long_period(link: LinkBase, rate_hz: int) -> bool:
     """Returns True if a link's delay repeats only after more ticks than can be analysed."""
-    period_s = find_link_period_s(link)
-    return period_s is not None and period_s * rate_hz > MAX_PERIOD_TICKS
+    period_s = link.repetition_s
+    return period_s is not None and float(period_s) * rate_hz > MAX_PERIOD_TICKS
 
 
 def compute_effective_delay(
@@ -442,11 +544,11 @@ def compute_effective_delay(
     if is_constant:
         # ages repeat, so two seconds beyond the delay contain all of them
         duration_s = min(duration_s, 2.0 + 2e-6 * model.location)
-    period_s = find_link_period_s(link)
+    period_s = link.repetition_s
     if period_s is not None and not _has_long_period(link, max(site_hz, peer_hz)):
         # ages are complete when the samples of a whole period have arrived
         longest_s = 2e-3 * sum(link.moments())
-        duration_s = max(duration_s, period_s + longest_s)
+        duration_s = max(duration_s, float(period_s) + longest_s)
     used_samples = link.draw_used_samples(
         key=link_key(scenario.seed, f"{peer}->{site}"),
         receiver_hz=site_hz,
@@ -486,14 +588,14 @@ def has_lasting_delays(scenario: Scenario) -> bool:
         if not scenario.alpha[i, j] and not scenario.timeline:
             continue
         site, peer = scenario.names[i], scenario.names[j]
-        link = find_final_link(scenario, f"{peer}->{site}")
+        link = scenario.find_final_link(f"{peer}->{site}")
 
         table = link.points
         if link.has_ending_trace and table is not None:
             if table[-1, 0] > 1e6 * scenario.duration_s:
                 return False
             continue
-        if find_link_period_s(link) is None or link.random:
+        if link.repetition_s is None or link.random:
             continue
 
         rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)

@@ -40,7 +40,7 @@ from ..blas_threads import limit_blas_threads
 from ..dominance_history import compute_lyapunov_weights
 from . import frequency_search, port_response
 from .characteristic_roots import Complex, Spectrum
-from .linear_loop import LinearLoop, gather_site_arguments
+from .linear_loop import LinearLoop
 from .operating_point import Equilibrium, OperatingConditions
 from .port_passivity import (
     EIGENVALUE_ROUNDING,
@@ -67,7 +67,7 @@ def freeze_external_torques(
         conditions: The sites, gains and delays of the loop.
         rest: The equilibrium, at which the torques are computed.
     """
-    arguments = gather_site_arguments(conditions, rest)
+    arguments = conditions.gather_site_arguments(rest)
     sites = []
     all_rates = conditions.evaluate_rates(arguments)
     for site, rates in zip(conditions.sites, all_rates, strict=True):
@@ -122,7 +122,7 @@ def build_proof_output(
     delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
     for i, site in enumerate(sites):
         Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
-        ports = port_response.find_site_ports(loop, site.name)
+        ports = loop.find_site_ports(site.name)
         followed = _list_followed_axes(site)
         for port, joint in zip(ports, followed, strict=True):
             gain = Lambda[joint - 1]
@@ -330,23 +330,23 @@ class PortAnalysis(NamedTuple):
         loop = linearise_teleoperator(conditions, rest)
         other_site = of or scenario.slave
 
-        sites = port_response.list_port_sites(loop)
+        sites = loop.sites
         delay_s = loop.longest_delay_s
         grid = frequency_search.build_frequency_grid(low, high, delay_s)
-        Y = port_response.build_admittance(loop)
-        w_rad_s = frequency_search.refine_frequencies(Y, grid)
-        Y = frequency_search.cache_response(Y, w_rad_s)
+        w_rad_s, Y = frequency_search.refine_response(
+            port_response.build_admittance(loop), grid
+        )
 
         joints = {
             joint: Passivity.check(port_response.select_ports(Y, ports), w_rad_s)
-            for joint, ports in port_response.group_ports_by_joint(loop).items()
+            for joint, ports in loop.ports_by_joint.items()
         }
         transparency: list[Transparency] = []
         for site in sites:
             if site != other_site:
                 transparency += Transparency.measure(loop, site, other_site)
 
-        clamped_loop = port_response.clamp_site(loop, other_site)
+        clamped_loop = loop.clamp_site(other_site)
         held_hands = _locate_hands(scenario, conditions, rest=rest, loop=loop, hands=hands)
         return cls(
             scenario=scenario,
@@ -485,7 +485,7 @@ def _locate_hands(
             continue
 
         q = site_q[np.newaxis, : site.layout.joints]
-        ports = port_response.find_site_ports(loop, site.name)
+        ports = loop.find_site_ports(site.name)
         arm = build_arm_rows(scenario, site.name)
         end_effector = arm.place_end_effector(q, np.zeros_like(q))
         J = end_effector.J[0]
@@ -509,8 +509,8 @@ def _locate_hands(
 
 def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
     """Returns for each port the index of its site in the linear model, shape (p,)."""
-    sites = port_response.list_port_sites(loop)
-    owners = [sites.index(port_response.parse_port_site(port)) for port in loop.inputs]
+    sites = loop.sites
+    owners = [sites.index(site) for site in loop.port_sites]
     return np.array(owners, dtype=np.int64)
 
 
@@ -538,7 +538,7 @@ def _check_proof(
         return None
 
     def evaluate(w: Array) -> Complex:
-        s = port_response.to_imaginary_axis(w)
+        s = np.asarray(1j * w, np.complex128)
         return port_response.evaluate_transfer(loop, s, output)
 
     return Passivity.check(evaluate, w_rad_s, beta)
@@ -555,14 +555,14 @@ def _check_two_ports(
     third one is once free and once clamped.
     """
     two_ports = []
-    sites = port_response.list_port_sites(loop)
-    ports_by_joint = port_response.group_ports_by_joint(loop)
-    site_of_port = [port_response.parse_port_site(name) for name in loop.inputs]
+    sites = loop.sites
+    ports_by_joint = loop.ports_by_joint
+    site_of_port = loop.port_sites
     for pair in combinations(sites, 2):
         others = [site for site in sites if site not in pair]
         clamped_sites = ["", *others] if len(others) == 1 else [""]
         for clamped in clamped_sites:
-            clamped_ports = port_response.find_site_ports(loop, clamped) if clamped else []
+            clamped_ports = loop.find_site_ports(clamped) if clamped else []
             for joint, ports in ports_by_joint.items():
                 pair_ports = [port for port in ports if site_of_port[port] in pair]
                 if len(pair_ports) == len(pair):
@@ -696,7 +696,7 @@ def _move_ports_to_end_effectors(
     names = []
     inputs = []
     outputs = []
-    arguments = gather_site_arguments(conditions, rest)
+    arguments = conditions.gather_site_arguments(rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         layout = ArgumentLayout.of_site(site)
         followed = _list_followed_axes(site)

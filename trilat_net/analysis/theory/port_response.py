@@ -40,7 +40,7 @@ import numpy as np
 from ...core import Array
 from ...errors import RuntimeFault, UsageError
 from .characteristic_roots import Complex
-from .linear_loop import DelayedTerm, LinearLoop
+from .linear_loop import LinearLoop
 
 PortResponse = Callable[[Array], Complex]
 """Matrices, shape (F, p, m), for frequencies of shape (F,), rad/s."""
@@ -246,100 +246,10 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
         )
 
     def evaluate_admittance(w_rad_s: Array) -> Complex:
-        s = to_imaginary_axis(w_rad_s)
+        s = np.asarray(1j * w_rad_s, np.complex128)
         return evaluate_transfer(loop, s)
 
     return evaluate_admittance
-
-
-def to_imaginary_axis(w_rad_s: Array) -> Complex:
-    """Returns the points s = j w at which a frequency response is evaluated, in 1/s.
-
-    At 1 Hz, w is 6.28 rad/s.
-
-    Args:
-        w_rad_s: Frequencies w, in rad/s.
-    """
-    return np.asarray(1j * w_rad_s, dtype=np.complex128)
-
-
-def parse_port_site(port: str) -> str:
-    """Returns the site in the name of a port or state, for example "m1" for "m1.tau2".
-
-    Args:
-        port: Name of an input or state of a linear model.
-    """
-    return port.partition(".")[0]
-
-
-def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
-    """Returns the names of the sites whose joints have inputs in a linear model.
-
-    The inputs are joint torques, such as "m1.tau1" for site m1. Each site is listed once, in
-    the order of its first input.
-
-    Args:
-        loop: Linear model of the coupled arms.
-    """
-    sites = [parse_port_site(name) for name in loop.inputs]
-    # a dict keeps each site once, in order
-    return tuple(dict.fromkeys(sites))
-
-
-def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
-    """Finds the ports of an arm, the joints at which its operator pushes.
-
-    Each port is an input of the linear model of all arms.
-
-    Args:
-        loop: The loop.
-        site: Name of the site.
-
-    Returns:
-        Indices of the ports among the inputs of the loop.
-
-    Raises:
-        UsageError: The loop has no such site.
-    """
-    ports = []
-    for n, name in enumerate(loop.inputs):
-        if parse_port_site(name) == site:
-            ports.append(n)
-    if not ports:
-        sites = ", ".join(list_port_sites(loop))
-        raise UsageError(f"there is no site {site!r} among the ports; the sites are {sites}")
-    return ports
-
-
-def _parse_port_joint(port: str) -> int:
-    """Returns the joint number in the name of a port, for example 2 for "m1.tau2".
-
-    A port is a joint at which an operator or a wall pushes an arm.
-
-    Args:
-        port: Name of the port.
-    """
-    _, _, number = port.rpartition("tau")
-    return int(number)
-
-
-def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
-    """Groups the inputs of a linear model by joint, in the order of the sites.
-
-    The first joints of all arms, for example, can then be analysed together, excluding the
-    other joints.
-
-    Args:
-        loop: The loop.
-
-    Returns:
-        A mapping from joint number to port indices.
-    """
-    ports: dict[int, list[int]] = {}
-    for port, name in enumerate(loop.inputs):
-        joint = _parse_port_joint(name)
-        ports.setdefault(joint, []).append(port)
-    return dict(sorted(ports.items()))
 
 
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
@@ -358,108 +268,6 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
         return rows[:, :, ports]
 
     return evaluate_selected
-
-
-def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
-    """Returns the linear model of the arms with one arm held still by a clamp.
-
-    The torque u_c of the clamp makes the arm's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
-    u + delayed terms), where x is the state, u the other torques, A_c and B_c the rows of the
-    loop's matrices for these accelerations, and B_cc the part of B_c that belongs to the arm's
-    own torques. The torque acts wherever the law uses the torque of this arm.
-
-    Args:
-        loop: The loop.
-        site: Name of the site.
-
-    Returns:
-        The loop excluding the ports, velocities and angles of the site.
-
-    Raises:
-        UsageError: There is no such site, or two clamped sites reflect force onto each other.
-    """
-    ports = find_site_ports(loop, site)
-    other_ports = [n for n in range(len(loop.inputs)) if n not in ports]
-    speeds = []
-    angles = []
-    for port in ports:
-        speed_name = loop.outputs[port]
-        angle_name = loop.inputs[port].replace(".tau", ".q")
-        speeds.append(loop.names.index(speed_name))
-        angles.append(loop.names.index(angle_name))
-    removed = {*speeds, *angles}
-    kept_states = [n for n in range(len(loop.names)) if n not in removed]
-    undelayed_term = DelayedTerm(0.0, loop.A, loop.B)
-    terms = [undelayed_term, *loop.delayed]
-    acceleration_block = np.ix_(speeds, ports)
-    for term in loop.delayed:
-        reflected_torque = term.B[acceleration_block]
-        if reflected_torque.any():
-            raise UsageError(
-                "clamped sites that reflect force onto each other do not have a finite "
-                f"response: {site}"
-            )
-    # the torque of the clamp as a sum of terms with delays
-    inverse_inertia = loop.B[acceleration_block]
-    inertia = np.linalg.inv(inverse_inertia)
-    sums: dict[float, DelayedTerm] = {}
-
-    def add_term(delay_s: float, A: Array, B: Array) -> None:
-        """Adds matrices to the part of the model that acts after a given delay.
-
-        Delays that differ only by rounding errors are considered equal.
-
-        Args:
-            delay_s: The delay, in s.
-            A: Effect of the delayed states.
-            B: Effect of the delayed torques.
-        """
-        key = round(delay_s, 12)
-        if key in sums:
-            previous = sums[key]
-            A = previous.A + A
-            B = previous.B + B
-        sums[key] = DelayedTerm(key, A, B)
-
-    clamp_torques = []
-    for term in terms:
-        by_state = term.A[speeds]
-        by_torque = term.B[speeds][:, other_ports]
-        clamp_by_state = -inertia @ by_state
-        clamp_by_torque = -inertia @ by_torque
-        clamp = DelayedTerm(term.delay_s, clamp_by_state, clamp_by_torque)
-        clamp_torques.append(clamp)
-    for term in terms:
-        other_effect = term.B[:, other_ports]
-        add_term(term.delay_s, term.A, other_effect)
-        effect = term.B[:, ports]
-        if not effect.any():
-            continue
-        for clamp in clamp_torques:
-            delay_s = term.delay_s + clamp.delay_s
-            effect_of_state = effect @ clamp.A
-            effect_of_torque = effect @ clamp.B
-            add_term(delay_s, effect_of_state, effect_of_torque)
-    kept_terms = []
-    kept_block = np.ix_(kept_states, kept_states)
-    for delay_s in sorted(sums):
-        total = sums[delay_s]
-        kept_A = total.A[kept_block]
-        kept_B = total.B[kept_states]
-        kept_term = DelayedTerm(delay_s, kept_A, kept_B)
-        kept_terms.append(kept_term)
-    undelayed, *delayed = kept_terms
-    active_terms = [term for term in delayed if term.A.any() or term.B.any()]
-    return LinearLoop(
-        names=tuple(loop.names[n] for n in kept_states),
-        inputs=tuple(loop.inputs[n] for n in other_ports),
-        outputs=tuple(loop.outputs[n] for n in other_ports),
-        A=undelayed.A,
-        B=undelayed.B,
-        C=loop.C[np.ix_(other_ports, kept_states)],
-        delayed=tuple(active_terms),
-        E=None if loop.E is None else loop.E[kept_states],
-    )
 
 
 TRANSPARENCY_BAND_HZ = (0.1, 10.0)
@@ -612,13 +420,13 @@ class Transparency(NamedTuple):
         frequencies_hz = np.union1d(points, TRANSPARENCY_BAND_HZ)
         w_rad_s = 2.0 * np.pi * frequencies_hz
 
-        ports = find_site_ports(loop, at)
+        ports = loop.find_site_ports(at)
         if at == of:
             raise UsageError(
                 f"a load cannot be placed at {at}, because this is the operator's own site"
             )
-        clamped_loop = clamp_site(loop, of)
-        clamped_ports = find_site_ports(clamped_loop, at)
+        clamped_loop = loop.clamp_site(of)
+        clamped_ports = clamped_loop.find_site_ports(at)
         free_admittance = build_admittance(loop)
         clamped_admittance = build_admittance(clamped_loop)
         evaluate_free = select_ports(free_admittance, ports)
@@ -631,7 +439,7 @@ class Transparency(NamedTuple):
             transparency = Transparency(
                 operator_site=at,
                 other_site=of,
-                joint=_parse_port_joint(loop.inputs[port]),
+                joint=loop.port_joints[port],
                 w_rad_s=w_rad_s,
                 free=1.0 / free[:, n, n],
                 clamped=1.0 / clamped[:, n, n],

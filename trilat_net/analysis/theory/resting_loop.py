@@ -1,8 +1,9 @@
 """Analyses the control loop of arms at rest in one common pose, with arbitrary gains.
 
-The search for the gains of an arm (`trilat tune --arm`) needs a single result: the rate at
-which small motions about a pose grow with these gains. `RestingLoop` computes it for any pose,
-any gains, and either the delays of the scenario or a constant delay.
+The search for the gains of an arm (`trilat tune --arm`) needs the rate at which small motions
+about a pose grow with these gains. `RestingLoop` computes the rate for any pose, any gains, and
+either the delays of the scenario or a constant delay. For comparison, it also determines the
+rate at which the motion of a simulated run grows.
 
 Invariant:
     - The gains and the start poses of the scenario have no effect.
@@ -13,13 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Array
+from ...core import BUCKETS_PER_S, Array
+from ...execution import FusedRun
 from ...scenario import Scenario
+from ..twins.envelope_trend import EnvelopeFit
 from .characteristic_roots import CharacteristicRoot
 from .floquet import SamplesInUse
 from .linear_edge import find_rightmost_root
 from .operating_point import Equilibrium, OperatingConditions
 
+_STILL_SHARE = 1e-7
+"""Share of the largest speed of a run below which a speed counts as rounding error."""
 _NO_ROOT_PER_S = -1e3
 """Real part of the root of a loop without roots, such as one with negligible gains, in 1/s."""
 
@@ -27,6 +32,9 @@ _NO_ROOT_PER_S = -1e3
 @dataclass(frozen=True)
 class RestingLoop:
     """The linearised control loop of arms at rest in one common pose.
+
+    `find_root` predicts how fast small motions grow, and `measure_growth` determines it from a
+    simulated run.
 
     Attributes:
         conditions: Tick rates of the arms, and the delays between them.
@@ -108,3 +116,21 @@ class RestingLoop:
         conditions = self.conditions._replace(sites=tuple(sites))
         root = find_rightmost_root(conditions, rest, sampled=sampled)
         return root or CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
+
+    @staticmethod
+    def measure_growth(run: FusedRun) -> EnvelopeFit:
+        """Determines whether the motion of a simulated run grows, decays or persists.
+
+        The motion is measured by the largest speed of all joints in each interval of 50 ms.
+
+        Args:
+            run: The run in the fused loop.
+
+        Returns:
+            The trend of the largest speed, with its rate in 1/s.
+        """
+        speed = np.max([site[:, 1] for site in run.maxima], axis=0)
+        t_s = np.arange(len(speed)) / BUCKETS_PER_S
+        floor = _STILL_SHARE * speed.max()
+        (fit,) = EnvelopeFit.fit_columns(t_s, speed[:, np.newaxis], floor, falls_first=True)
+        return fit

@@ -24,7 +24,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,10 +31,10 @@ import numpy as np
 from ...core import BUCKETS_PER_S, Array
 from ...errors import NotRepeatable, UsageError
 from ...hooks import find_hook
-from ...log import Log, open_log
+from ...log import Log
 from ...results import Result, finite_or_none
 from ...scenario import Scenario
-from ..delay_period import DelayPeriod, find_burst_interval_s, find_final_link
+from ..delay_period import DelayPeriod, find_burst_interval_s
 from ..run_end import RunEnd, find_coupled_sites
 from ..torque_sources import VirtualWall
 from .envelope_trend import EnvelopeFit, EnvelopeTrend
@@ -483,7 +482,7 @@ def _find_varying_period_s(scenario: Scenario) -> float | None:
     away in another. The period is that of all links and of the ticks of all sites. The result
     is `None` if all delays are constant, or if some delay never repeats.
     """
-    links = [find_final_link(scenario, name) for name in scenario.links]
+    links = [scenario.find_final_link(name) for name in scenario.links]
     if all(link.constant_delay_ms is not None for link in links):
         return None
     return DelayPeriod.of_scenario(scenario).true_s
@@ -685,7 +684,7 @@ def _judge_worst_joint(
     """Evaluates the effect of a push at all joints of a group together, or at the worst joint.
 
     Slow growth at one joint is invisible in the amplitude of the group while a faster joint
-    still decays from a larger amplitude. Therefore each joint is judged by itself, too.
+    still decays from a larger amplitude. Therefore each joint is also judged separately.
 
     Args:
         path: The twin's difference from its run.
@@ -835,6 +834,70 @@ class PushedTwins(Result):
     growth: TwinGrowth
     linear: _LinearSizes | None = None
 
+    @classmethod
+    def of_log(
+        cls,
+        log: Log,
+        at_s: float = 0.0,
+        push: Mapping[str, float] | Sequence[str] = (),
+        delta: str = "",
+    ) -> "PushedTwins":
+        """Repeats a recorded run with small pushes at a given time.
+
+        Args:
+            log: The log.
+            at_s: Time of the pushes, in s.
+            push: Sizes by target, as in `{"m1.q1": 1e-6}`, or texts such as "m1.q1=1e-6". Each
+                push makes one twin. By default the pushes are those of a certificate.
+            delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+
+        Raises:
+            UsageError: There is no such target, time or range.
+            LogError: The log cannot be read, or cannot be executed again.
+            CodeWithheld: The code of a law of the log may not be executed.
+        """
+        scenario = log.scenario
+        targets = list(push.items()) if isinstance(push, Mapping) else [*map(_parse_push, push)]
+        end_s = max(len(log[site]) / log[site].rate_hz for site in log.sites)
+        if not 0.0 <= at_s < end_s and end_s > 0.0:
+            raise UsageError(
+                f"--at must be from 0 s to before the end of the run, {end_s:g} s, "
+                f"not {at_s:g} s"
+            )
+        if delta and len(targets) > 1:
+            names = ", ".join(target for target, _ in targets)
+            raise UsageError(
+                f"--delta varies the size of a single push, but --push names {names}"
+            )
+
+        # Without options, the twins and the judged part are those of a certificate.
+        is_of_certificate = not targets and not delta and at_s == 0.0
+        counts_from_s = at_s
+        quiet_from_s = math.inf
+        sizes = []
+        if delta:
+            target, _ = next(iter(targets), ("q", 0.0))
+            sizes = _parse_sizes(delta)
+            pushes = [
+                Push.parse(scenario, target, size, at_s)._replace(largest=math.inf)
+                for size in sizes
+            ]
+        elif targets:
+            pushes = [Push.parse(scenario, target, size, at_s) for target, size in targets]
+        elif is_of_certificate:
+            pushes = Push.choose(scenario)
+            end = RunEnd.of_log(log)
+            counts_from_s = end.counts_from_s
+            quiet_from_s = end.quiet_from_s
+        else:
+            pushes = [
+                default._replace(at_s=at_s, again=False) for default in Push.choose(scenario)
+            ]
+        twins = Twins.of_log(log, pushes, own_laws=True)
+        growth = TwinGrowth.of_twins(scenario, twins, counts_from_s, quiet_from_s)
+        linear = _find_linear_sizes(scenario, growth, sizes) if delta else None
+        return cls(log, at_s, growth, linear)
+
     def measure_amplitudes(self, joints: Sequence[int]) -> list[Array]:
         """Computes the effect of each push on some joints over time, as logarithms.
 
@@ -907,74 +970,6 @@ class PushedTwins(Result):
             "linear": linear,
             "text": text,
         }
-
-
-def twin(
-    log: str | Path | Log,
-    at_s: float = 0.0,
-    push: Mapping[str, float] | Sequence[str] = (),
-    delta: str = "",
-) -> PushedTwins:
-    """Repeats a recorded run with small pushes at a given time, as `trilat twin` does.
-
-    A twin is a repeated run in which one quantity was changed by a small amount, the push. The
-    result shows how the difference between each twin and the run develops.
-
-    >>> found = tn.twin(tn.simulate("two_sites", duration_s=4), at_s=1, push={"m.q1": 1e-6})
-    >>> found.growth.pushes[0].rate_per_s < 0.0
-    True
-
-    Args:
-        log: The log, or its path.
-        at_s: Time of the pushes, in s.
-        push: Sizes by target, as in `{"m1.q1": 1e-6}`, with one twin per push. A target is a
-            joint's angle, `m1.q1`, a joint's speed, `m1.qd1`, an estimate, `m1.theta1`, or
-            several quantities in a random direction, `m1.q` or `q`. By default the pushes are
-            those of `certify`. If they are made at 0 s, their growth is judged as in `certify`.
-        delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
-
-    Raises:
-        UsageError: There is no such target, time or range.
-        LogError: The log cannot be read, or cannot be executed again.
-        CodeWithheld: The code of a law of the log may not be executed.
-    """
-    log = log if isinstance(log, Log) else open_log(log)
-    scenario = log.scenario
-    targets = list(push.items()) if isinstance(push, Mapping) else [*map(_parse_push, push)]
-    end_s = max(len(log[site]) / log[site].rate_hz for site in log.sites)
-    if not 0.0 <= at_s < end_s and end_s > 0.0:
-        raise UsageError(
-            f"--at must be from 0 s to before the end of the run, {end_s:g} s, not {at_s:g} s"
-        )
-    if delta and len(targets) > 1:
-        names = ", ".join(target for target, _ in targets)
-        raise UsageError(f"--delta varies the size of a single push, but --push names {names}")
-
-    # Without options, the twins and the judged part are those of a certificate.
-    is_of_certificate = not targets and not delta and at_s == 0.0
-    counts_from_s = at_s
-    quiet_from_s = math.inf
-    sizes = []
-    if delta:
-        target, _ = next(iter(targets), ("q", 0.0))
-        sizes = _parse_sizes(delta)
-        pushes = [
-            Push.parse(scenario, target, size, at_s)._replace(largest=math.inf)
-            for size in sizes
-        ]
-    elif targets:
-        pushes = [Push.parse(scenario, target, size, at_s) for target, size in targets]
-    elif is_of_certificate:
-        pushes = Push.choose(scenario)
-        end = RunEnd.of_log(log)
-        counts_from_s = end.counts_from_s
-        quiet_from_s = end.quiet_from_s
-    else:
-        pushes = [default._replace(at_s=at_s, again=False) for default in Push.choose(scenario)]
-    twins = Twins.of_log(log, pushes, own_laws=True)
-    growth = TwinGrowth.of_twins(scenario, twins, counts_from_s, quiet_from_s)
-    linear = _find_linear_sizes(scenario, growth, sizes) if delta else None
-    return PushedTwins(log, at_s, growth, linear)
 
 
 def _parse_push(text: str) -> tuple[str, float]:

@@ -290,12 +290,12 @@ def twin_command(
     simulated in full, without linearisation (docs/logs/twins.md). The exit code is 0 whether or
     not the disturbances grow.
     """
-    from ...analysis import twin
+    from ...analysis import PushedTwins
 
     options.check_picture(picture, force=force)
     log = laws.open(*files)
     with terminal.progress_lines(f"repeating {files[0]} with small pushes"):
-        growth = twin(log, at_s, push or (), delta)
+        growth = PushedTwins.of_log(log, at_s, push or (), delta)
     options.print_and_draw(
         growth, picture, "twin_differences:draw_twins", growth, as_json=as_json
     )
@@ -582,11 +582,11 @@ def linear_command(
     verdict.
     """
     options.check_picture(picture, force=force)
-    from ...analysis import analyse_linear_loop
+    from ...analysis import LinearAnalysis
 
     draws_ports = picture is not None and drawn is not LinearFigure.ROOTS
     with terminal.progress_lines(f"linearising {scenario}"):
-        analysis = analyse_linear_loop(
+        analysis = LinearAnalysis.compute(
             scenario,
             overrides or [],
             pose=_parse_pose(pose),

@@ -149,13 +149,16 @@ class DelayAxis(NamedTuple):
 
     Attributes:
         x_ms: Delays at which the curves are evaluated, in ms, shape (P,). They extend to the
-            longest delay or age, and are equally spaced on a linear or a logarithmic axis.
-        is_logarithmic: True if only a few values are large, in which case a linear axis would
-            hide the others.
+            longest delay or age, and are equally spaced on a linear or a logarithmic axis. A
+            linear axis begins at 0.
     """
 
     x_ms: Array
-    is_logarithmic: bool
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """True if only a few values are large, so that a linear axis would hide the others."""
+        return bool(self.x_ms[0] > 0.0)
 
     @classmethod
     def of_links(cls, links: Sequence[DelayDistribution]) -> "DelayAxis":
@@ -173,12 +176,12 @@ class DelayAxis(NamedTuple):
         longest_ms = float(known_ms.max(initial=0.0))
         end_ms = 1.05 * max(longest_ms, 1.0)
         if not needs_log_axis(known_ms):
-            return cls(np.linspace(0.0, end_ms, _POINTS), False)
+            return cls(np.linspace(0.0, end_ms, _POINTS))
 
         # A logarithmic axis has no 0. It begins below nearly all values.
         short_ms = float(np.percentile(known_ms, 1.0))
         start_ms = max(0.5 * short_ms, 0.1)
-        return cls(np.geomspace(start_ms, end_ms, _POINTS), True)
+        return cls(np.geomspace(start_ms, end_ms, _POINTS))
 
     def compute_percent(self, values_ms: Array) -> Array:
         """Returns the percentage of values that do not exceed each delay on the axis.

@@ -59,8 +59,8 @@ from trilat_studies.tuning.candidate import CandidateClass, CandidateScore, Tuni
 from trilat_studies.tuning.search_space import SEARCH_SPACES
 
 import trilat_net
-from trilat_net.analysis.decision_facts import LoopRoots
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
+from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import TwinGrowth
 from trilat_net.core.step.vectors import Array

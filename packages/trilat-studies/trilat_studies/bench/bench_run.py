@@ -39,10 +39,10 @@ from trilat_net.analysis import (
     RunEnd,
     Stability,
     TwinGrowth,
+    VirtualRun,
     VirtualWall,
     build_arm_rows,
-    decision_facts,
-    judge_virtual_run,
+    stability_decision,
 )
 from trilat_net.core import Array, TorqueKind
 from trilat_net.errors import CodeFailed, UsageError
@@ -168,7 +168,7 @@ class JudgedRun(NamedTuple):
     records: dict[str, RecordBatch]
     end: RunEnd
     twins: TwinGrowth | None
-    roots: decision_facts.LoopRoots
+    roots: stability_decision.LoopRoots
     stability: Stability
     text: str
     at_limit: bool = False
@@ -313,7 +313,7 @@ def _judge_records(scenario: Scenario, whole: WholeRun) -> JudgedRun:
         whole: The run with its records.
     """
     records, end, run = whole
-    judged = judge_virtual_run(scenario, run, end)
+    judged = VirtualRun(scenario, run, end)
     decision = judged.decision
     return JudgedRun(
         scenario=scenario,

@@ -6,7 +6,7 @@ is extended and classified again.
 
 Invariant:
     - A result depends only on the cell's scenario and on the longest allowed duration.
-    - A log of the same run gets the same verdict, because both use `judge.judge_virtual_run`
+    - A log of the same run gets the same verdict, because both use `judge.VirtualRun`
       and the roots of `loop_roots`.
     - To save space, a run stores only the difference between the text of its scenario and that
       of the sweep's scenario. The full text can be restored exactly.
@@ -26,8 +26,7 @@ from trilat_net.analysis import (
     GrowthColumn,
     RunEnd,
     Stability,
-    find_run_roots,
-    judge_virtual_run,
+    VirtualRun,
 )
 from trilat_net.execution import FusedRun
 from trilat_net.results import finite_or_none
@@ -297,7 +296,7 @@ class _CellInProgress:
         Called once, after the last extension, because the certificate needs the roots of the
         control loop, which are slow to compute.
         """
-        judged = judge_virtual_run(self._scenario, self.run)
+        judged = VirtualRun(self._scenario, self.run)
         decision = judged.decision
         return msgspec.structs.replace(
             self._outcome,
@@ -318,7 +317,7 @@ class _CellInProgress:
         self._is_finished = self._outcome.is_conclusive
         has_user_law = bool(self._scenario.user_laws)
         if self._is_finished and has_user_law and run_end.stability is Stability.NOT_STABLE:
-            roots = find_run_roots(self._scenario, self.run)
+            roots = VirtualRun(self._scenario, self.run, run_end).roots
             self._is_finished = roots.measure_decay_misfit(run_end) > 1.0
 
 
@@ -415,7 +414,7 @@ def _chatters(scenario: Scenario, run: FusedRun) -> bool:
     environments = chain.from_iterable(spec.environment for spec in scenario.sites.values())
     if not any(environment.actor.sampled for environment in environments):
         return False
-    return find_run_roots(scenario, run).is_refutation
+    return VirtualRun(scenario, run).roots.is_refutation
 
 
 def _has_pronounced_trend(outcome: CellResult) -> bool:

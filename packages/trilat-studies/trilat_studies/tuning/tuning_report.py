@@ -23,10 +23,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from trilat_net.analysis import ObservedFinding
 from trilat_net.errors import count_nouns
 from trilat_net.files import write_whole
 from trilat_net.presentation import (
+    NEGATIVE_ENERGY_MEANING,
     REPORT_SIZE,
     SITE_COLOURS,
     Block,
@@ -143,7 +143,7 @@ class TuningReport:
             return []
         return [
             f"{', '.join(laws)} declare energies, which `trilat certify` checks and the "
-            f"classes above do not: {ObservedFinding.NEGATIVE.meaning}"
+            f"classes above do not: {NEGATIVE_ENERGY_MEANING}"
         ]
 
     def tabulate_front(self, search: "CandidateSearch", most: int | None = None) -> TextTable:
