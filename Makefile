@@ -107,7 +107,7 @@ lint: $(VENV)/dev.stamp
 
 platforms: $(VENV)/dev.stamp # processes of sessions use functions of POSIX, and of Linux
 	for other in win32 darwin; do \
-		$(BIN)/mypy --platform $$other --follow-imports silent --exclude 'trilat_net/app/(demo_session\.py|play/)' --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_people.experiment -m trilat_people.hand_impedance -p trilat_studies -p trilat_ros2 || exit 1; \
+		$(BIN)/mypy --platform $$other --follow-imports silent --exclude 'trilat_net/app/(demo_session\.py|process_starter\.py|play/)' --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_people.experiment -m trilat_people.hand_impedance -p trilat_studies -p trilat_ros2 || exit 1; \
 	done
 
 faults: $(VENV)/dev.stamp
