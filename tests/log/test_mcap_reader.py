@@ -228,7 +228,7 @@ def test_absurd_contents_are_refused_with_place(
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
     with pytest.raises(
         LogError,
-        match=r"file: needs too much memory for a file of \d+ bytes: the data up to byte \d+",
+        match=r"file needs too much memory for a file of \d+ bytes: the data up to byte \d+",
     ):
         read_walked(data)
     streaming = McapReader(io.BytesIO(data), "file", kept=False)

@@ -164,6 +164,12 @@ def _examine_reaching(
         reason = getattr(error, "verify_message", "") or error.reason or str(error)
         text = f"{endpoint} answers, but not as a member with these keys: {reason}"
         return DoctorFinding("links", "fail", text)
+    except socket.gaierror as error:
+        text = (
+            f"{endpoint} cannot be reached: the host name {address[0]!r} does not resolve "
+            f"({error.strerror}): correct it, or give an address"
+        )
+        return DoctorFinding("links", "fail", text)
     except OSError as error:
         text = f"{endpoint} cannot be reached: {error.strerror or error}"
         return DoctorFinding("links", "fail", text)

@@ -16,12 +16,12 @@ from trilat_net.analysis.run_view import RunView
 METRIC = """
 import numpy as np
 
-from trilat_net.analysis.metrics.measures import Quantity, measures, metric
+from trilat_net.analysis.metrics.measures import Metric, Quantity, measures
 
 
 @measures("site", "haste", Quantity("haste_rad_s", "mean |qd|", "rad/s"))
 def measure_haste(view, site):
-    return {"haste_rad_s": metric(float(np.abs(view.log[site].qd).mean()))}
+    return {"haste_rad_s": Metric.of_value(float(np.abs(view.log[site].qd).mean()))}
 """
 LOOK = """
 import json, sys
