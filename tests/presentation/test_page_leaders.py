@@ -14,6 +14,7 @@ from tests.live.browsers import needs_browser
 from tests.page.whole_pages import watched_page
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.dominance_history import DominanceHistory
+from trilat_net.log.findings import CheckReport
 from trilat_net.log.log_reader import Log
 from trilat_net.presentation.charts import ChartBuilder
 from trilat_net.presentation.page import write_report
@@ -97,7 +98,12 @@ def test_the_bar_stands_below_the_slider(
     size: tuple[int, int], browser: Browser, tmp_path: Path
 ) -> None:
     log = simulate_training()
-    path, _ = write_report(log, tmp_path, certificate=Certificate.of_log(log))
+    path, _ = write_report(
+        log,
+        tmp_path,
+        certificate=Certificate.of_log(log),
+        wait_for_checks=lambda: CheckReport([]),
+    )
     options: dict[str, Any] = {
         "viewport": {"width": size[0], "height": size[1]},
         "reduced_motion": "reduce",
