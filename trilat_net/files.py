@@ -195,6 +195,18 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def read_foreign_permissions(path: Path) -> int:
+    """Returns the permission bits that a file grants to its group and to all other users.
+
+    A file that contains a secret should grant none. Returns 0 on Windows, which uses access
+    control lists instead.
+
+    Args:
+        path: The file.
+    """
+    return 0 if os.name == "nt" else path.stat().st_mode & 0o077
+
+
 def make_folder(folder: Path, *, may_be_link: bool = True) -> Path:
     """Creates a folder and any missing parent folders, and returns its path.
 

@@ -1,4 +1,4 @@
-"""Lists optional packages and libraries, and explains which installation lacks one.
+"""Lists optional packages and libraries, and names the command that installs a missing one.
 
 If a user calls `trilat sweep` and trilat-studies is not installed, the program needs to
 recognise the command to tell the user what to install. The lists also define the order of the

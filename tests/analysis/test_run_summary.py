@@ -1,5 +1,7 @@
 """The counts of `info`: messages, gaps and the time between messages, without decoding."""
 
+import errno
+import io
 import json
 from pathlib import Path
 
@@ -26,8 +28,10 @@ from tests.log.builders import (
     rewrite_log,
     write_log,
 )
+from trilat_net import files
 from trilat_net.analysis.file_overview import info, summarise_run
 from trilat_net.errors import LogError
+from trilat_net.log.findings import CheckReport, Finding
 
 
 def parse_strictly(facts):
@@ -233,3 +237,36 @@ def test_ticks_are_those_of_the_last_start() -> None:
     last = next(event for event in log.events if (event.kind, event.member) == ("end", "s"))
     log.events.insert(0, msgspec.structs.replace(last, ticks=30, t_ns=0))
     assert summarise_run(log)["sites"]["s"]["made_ticks"] == last.ticks == 200
+
+
+class _FailingDisk(io.BytesIO):
+    """A file on a disk that fails in its middle."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        if self.tell() > len(self.getbuffer()) // 2:
+            raise OSError(errno.EIO, "Input/output error")
+        return super().read(size)
+
+
+def test_a_disk_that_fails_midway_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_log(tmp_path, make_log_bytes("two_sites"))
+    opened = []
+
+    def open_failing(path: Path) -> _FailingDisk:
+        opened.append(_FailingDisk(path.read_bytes()))
+        return opened[-1]
+
+    monkeypatch.setattr(files, "open_regular", open_failing)
+    with pytest.raises(LogError, match=r"run\.mcap cannot be read: Input/output error"):
+        info(path)
+    assert [stream.closed for stream in opened] == [True]
+
+
+def test_a_report_of_checks_prints_its_findings() -> None:
+    finding = Finding("records")
+    finding.add("run.mcap", None, "three are missing")
+    report = CheckReport([finding.conclude("all are there")])
+    assert report.summary() == "records: three are missing"
+    assert repr(report) == "<CheckReport records: three are missing>"

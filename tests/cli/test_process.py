@@ -50,7 +50,6 @@ import sys, threading
 from trilat_net import __main__
 from trilat_net.app import cli
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.package_names import STUDY_LIBRARIES
 called = threading.Event()
 def take(key, payload):
     called.set()

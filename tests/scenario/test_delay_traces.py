@@ -109,6 +109,7 @@ def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
     assert load_scenario(path).links["m1->s"].trace == TEXT
     setup = loaded.setup("s").links[0]
     assert setup.models[0].at_end == LinkModel.follow_trace("loop").at_end
+    assert setup.models[0].at_end != LinkModel.follow_trace("hold").at_end
     assert setup.traces[0] is not None
     assert setup.traces[0].tolist() == POINTS
 

@@ -100,8 +100,7 @@ class _FileInventory:
             lambda: _Messages(array("Q"), array("Q"), array("Q"))
         )
 
-        for path, reader in zip(paths, McapReader.of_files(paths, progress), strict=True):
-            self._read_file(path, reader)
+        McapReader.read_files(paths, self._read_file, progress)
 
     def _read_file(self, path: Path, reader: McapReader) -> None:
         """Adds a file to the inventory: its channels, the numbers of its messages, its damage.

@@ -117,7 +117,8 @@ class VirtualRun:
 
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.
-        run: The run in the fused loop.
+        run: The run in the fused loop. It must not be continued afterwards, because later
+            evidence would then be about another run.
         end: How the motion ends. If `None`, this is determined from the run.
     """
 

@@ -12,7 +12,6 @@ Invariant:
     - No child process is left when a function returns.
 """
 
-import gc
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
@@ -30,6 +29,7 @@ from trilat_net.entry_points import COMMANDS, load_entry
 from trilat_net.errors import LogRefused, RunFailed
 from trilat_net.files import find_page, make_folder, make_results_folder, write_whole
 from trilat_net.net import topics
+from trilat_net.process import freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.signals import Interrupt
 
@@ -395,7 +395,8 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
     """Runs the starter process, from which the processes of a session are forked.
 
     Forked processes start quickly, because all modules are imported and all code is compiled.
-    As with `os.fork`, the function returns in every process: in each fork, which then runs its
+    The function stands in this module because the forks need most of its imports. As with
+    `os.fork`, it returns in every process: in each fork, which then runs its
     command, and finally in the starter, after the requesting process has disappeared.
 
     Args:
@@ -405,7 +406,6 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
     Returns:
         In a fork, the command and arguments that the fork must run. In the starter, `None`.
     """
-    # This function belongs to this module because the forks need most of its imports.
     # Until all modules are imported, the signal simply ends this process.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     scenario = load_scenario(scenario_file)
@@ -416,10 +416,7 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
         sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
         for name in sites_by_counts.values():
             warm_up(scenario, name)
-    # Collections in the forked copies then skip the objects that exist now, and the memory of
-    # these objects stays shared.
-    gc.collect()
-    gc.freeze()
+    freeze_gc()
     # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
     # is delivered as soon as the copy has one.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -41,6 +41,7 @@ from ..net import (
     Clock,
     Connection,
     SystemClock,
+    check_hosts,
     read_member_keys,
 )
 from .machine_load import check_machine_load
@@ -163,12 +164,6 @@ def _examine_reaching(
     except ssl.SSLError as error:
         reason = getattr(error, "verify_message", "") or error.reason or str(error)
         text = f"{endpoint} answers, but not as a member with these keys: {reason}"
-        return DoctorFinding("links", "fail", text)
-    except socket.gaierror as error:
-        text = (
-            f"{endpoint} cannot be reached: the host name {address[0]!r} does not resolve "
-            f"({error.strerror}): correct it, or give an address"
-        )
         return DoctorFinding("links", "fail", text)
     except OSError as error:
         text = f"{endpoint} cannot be reached: {error.strerror or error}"
@@ -443,6 +438,11 @@ class MachineExamination:
                 yield _examine_listening(endpoint, address, is_protected=is_protected)
 
         for endpoint in secured.connect_addresses:
+            try:
+                check_hosts([endpoint])
+            except UsageError as error:
+                yield DoctorFinding("links", "fail", str(error))
+                continue
             address = _split_address(endpoint)
             if endpoint.startswith("quic/"):
                 keys = self._member_keys

@@ -43,10 +43,12 @@ from ..net import (
     Clock,
     Connection,
     DefaultEndpoints,
+    MemberKeys,
     PeerSample,
     StampedInbox,
     SystemClock,
     create_keys,
+    read_member_keys,
 )
 
 SESSION = "benchmark"
@@ -213,7 +215,7 @@ class NearEnd:
 
 def _open(
     endpoint: str,
-    keys: str | Path | None,
+    keys: MemberKeys | None,
     *,
     listens: bool,
     insecure: bool,
@@ -224,7 +226,7 @@ def _open(
 
     Args:
         endpoint: Endpoint to listen at or to connect to.
-        keys: Folder with the keys of a site. They are used only if the endpoint is encrypted.
+        keys: Keys of a site. They are used only if the endpoint is encrypted.
         listens: True for the far end.
         insecure: True to permit connections without keys, because everybody on the network is
             trusted.
@@ -283,11 +285,12 @@ def run_far_end(
     Raises:
         UsageError: An endpoint or the keys cannot be used.
     """
+    member_keys = None if keys is None else read_member_keys(keys)
     clock = SystemClock()
     started_ns = clock.monotonic_ns()
     with ExitStack() as stack:
         for endpoint in endpoints:
-            bus, member = _open(endpoint, keys, listens=True, insecure=insecure)
+            bus, member = _open(endpoint, member_keys, listens=True, insecure=insecure)
             answer_benchmarks(stack.enter_context(closing(bus)), member)
         say(f"answers benchmarks at {', '.join(endpoints)}; Ctrl-C ends it")
         while not stopped() and clock.monotonic_ns() - started_ns < duration_s * 1e9:
@@ -590,10 +593,11 @@ def ping_benchmark(
     with ExitStack() as stack:
         if not connect:
             connect, keys = stack.enter_context(_run_local_far_end(duration_s))
+        member_keys = None if keys is None else read_member_keys(keys)
         case_s = duration_s / (len(connect) * len(SIZE_FACTORS) * len(RATE_SHARES))
         rows: list[dict[str, Any]] = []
         for endpoint in connect:
-            rows += _measure_endpoint(endpoint, keys, needs, case_s)
+            rows += _measure_endpoint(endpoint, member_keys, needs, case_s)
 
     # Only the case with the scenario's own message size and rate is judged.
     scenario_case = (needs.sample_bytes, needs.rate_hz)
@@ -609,7 +613,7 @@ def ping_benchmark(
 
 def _measure_endpoint(
     endpoint: str,
-    keys: str | Path | None,
+    keys: MemberKeys | None,
     needs: NetworkNeeds,
     case_s: float,
 ) -> Iterator[dict[str, Any]]:
@@ -619,7 +623,7 @@ def _measure_endpoint(
 
     Args:
         endpoint: Endpoint of the far end.
-        keys: Folder with the keys of this end. `None` if the endpoint is not encrypted.
+        keys: Keys of this end. `None` if the endpoint is not encrypted.
         needs: Requirements of the scenario, which determine the sizes and rates.
         case_s: Duration of each measurement, in s.
 

@@ -174,19 +174,23 @@ class RunningSession:
                 is_last_try = self._clock.monotonic_ns() >= give_up_ns
                 ignore_error = nullcontext() if is_last_try else suppress(SessionError)
                 with ignore_error:
-                    info = SessionSearch(bus, self._clock, self.name).find_running(site)
+                    info = self._search(bus).find_running(site)
                     break
                 self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)
 
             scenario = parse_embedded(info.scenario, self.name)
             yield bus, scenario
 
+    def _search(self, bus: Bus) -> SessionSearch:
+        """Returns the search for the sites of this session over a network connection."""
+        return SessionSearch(bus, self._clock, self.name)
+
     def lead(
         self,
         site: str,
         device: Device,
         *,
-        stopped: Callable[[], bool] = lambda: False,
+        stopped: Callable[[], bool] = _never_stopped,
         say: Callable[[str], None] = print,
         timeout_s: float = REPLY_TIMEOUT_S,
     ) -> None:
@@ -332,7 +336,7 @@ class RunningSession:
         # In a session with keys, every member may stop arms, but only the operator may do more.
         member = "" if order == "stop" else OPERATOR
         with self.reach(member) as bus:
-            scenario, infos = SessionSearch(bus, self._clock, self.name).find_all()
+            scenario, infos = self._search(bus).find_all()
             for name in sites:
                 if name not in scenario.names:
                     known = f"its sites are {', '.join(scenario.names)}"
@@ -376,7 +380,7 @@ class RunningSession:
             SessionError: The session has not begun, or a site does not reply.
         """
         with self.reach() as bus:
-            scenario, infos = SessionSearch(bus, self._clock, self.name).find_all()
+            scenario, infos = self._search(bus).find_all()
             present = _list_present(scenario, infos)
 
             missing = [name for name in present if name not in infos]
@@ -477,7 +481,7 @@ class RunningSession:
                 reply.
         """
         with self.reach() as bus:
-            SessionSearch(bus, self._clock, self.name).find_running(site)
+            self._search(bus).find_running(site)
             return self._send_change(bus, site, request)
 
     @contextmanager
@@ -549,7 +553,7 @@ class RunningSession:
             The reply of the site, as a sentence.
         """
         with self.reach() as bus:
-            scenario, infos = SessionSearch(bus, self._clock, self.name).find_all()
+            scenario, infos = self._search(bus).find_all()
             first_present = next(name for name in scenario.names if name in infos)
             reply = self._send_change(bus, first_present, ChangeRequest(mark=text))
             return reply.text
@@ -596,7 +600,7 @@ class RunningSession:
             A function that returns the current weights, keyed by peer name.
         """
         with self.reach("") as bus:
-            info = SessionSearch(bus, self._clock, self.name).find_running(site)
+            info = self._search(bus).find_running(site)
             members = SessionMembers(bus, self._clock, self.name)
             read_records = members.subscribe(State, site, capacity=256)
             read_events = members.subscribe(Event, site, capacity=256)

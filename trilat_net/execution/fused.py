@@ -38,7 +38,6 @@ from ..scenario import (
     PlantPlayer,
     Scenario,
 )
-from .virtual import SimulatedLog
 
 _BLOCK_TICKS = 4096
 """Interval at which the records of `FusedRun.simulate_log` are copied, in ticks of the fastest
@@ -156,6 +155,8 @@ class FusedRun(CompiledRun):
             ScenarioError: The scenario cannot run in virtual time.
             LawFailed: A user's control law failed.
         """
+        from .virtual import SimulatedLog  # takes time: it loads the writer of logs
+
         if not _is_described_by_columns(scenario):
             return SimulatedLog(scenario)
         run = cls(scenario, keep=_BLOCK_TICKS + 1)

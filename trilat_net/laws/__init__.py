@@ -29,11 +29,18 @@ __all__ = [
     "COMMON_MOTION_SHARE",
     "BlockKey",
     "LawSituation",
+    "StabilityCondition",
     "LinearForm",
 ]
 
 if TYPE_CHECKING:
-    from .conditions import COMMON_MOTION_SHARE, BlockKey, LawSituation, LinearForm
+    from .conditions import (
+        COMMON_MOTION_SHARE,
+        BlockKey,
+        LawSituation,
+        LinearForm,
+        StabilityCondition,
+    )
     from .interface import (
         DAMPING,
         ERROR_DAMPING,
@@ -48,7 +55,9 @@ else:
     __getattr__ = import_on_use(
         __name__,
         {
-            "conditions": "BlockKey COMMON_MOTION_SHARE LawSituation LinearForm",
+            "conditions": (
+                "BlockKey COMMON_MOTION_SHARE LawSituation LinearForm StabilityCondition"
+            ),
             "interface": (
                 "ControlLaw DAMPING ERROR_DAMPING GainRange LawSettings TuningRun TuningSite"
             ),

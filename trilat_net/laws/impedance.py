@@ -241,7 +241,7 @@ class Impedance(ControlLaw):
         slave_loads = hands[slave]
         if slave_loads == ():
             text = "the slave touches nothing, so no loop is closed, whatever the delays"
-            bound = _describe_stiffest_wall(situation, slave)
+            bound = _describe_stiffest_wall(situation, slave, hands)
             return StabilityCondition(True, f"{text}; {bound}")
         if np.isnan(situation.longest_s):
             text = (
@@ -480,7 +480,9 @@ def _select_master_hands(
     return list(product(*selections_by_site))
 
 
-def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
+def _describe_stiffest_wall(
+    situation: LawSituation, slave: int, hands: Sequence[Sequence[ArmLoad] | None]
+) -> str:
     """Returns a phrase about the stiffest wall for which the loop is stable.
 
     For example, "with a spring of up to 250 N m/rad at the slave, ...". The bound is the
@@ -488,10 +490,11 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
     states the reason.
 
     Args:
-        situation: All sites, their laws and their hands.
+        situation: All sites and their laws.
         slave: Index of the slave.
+        hands: Springs and dampers of the hands at each site, see `LawSituation.list_loads`.
     """
-    selections = _select_master_hands(situation.list_loads(), slave)
+    selections = _select_master_hands(hands, slave)
     if selections is None:
         return "no bound is known for walls, because of the hands at the masters"
     factors = situation.alpha[slave]

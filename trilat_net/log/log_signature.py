@@ -30,11 +30,11 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import (
 from ..errors import LogError, UsageError, count_nouns
 from ..files import (
     open_regular,
+    read_foreign_permissions,
     reading,
     refuse_existing,
     write_whole,
 )
-from ..net import read_foreign_permissions
 from .findings import Finding
 from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity

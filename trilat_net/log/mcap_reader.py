@@ -287,18 +287,20 @@ class McapReader:
         self._is_scanned = False
 
     @classmethod
-    def of_files(
-        cls, paths: Sequence[Path], progress: Progress | None = None
-    ) -> Iterator["McapReader"]:
-        """Opens MCAP files one after another. A file is closed before the next one is opened.
+    def read_files(
+        cls,
+        paths: Sequence[Path],
+        read_file: Callable[[Path, "McapReader"], None],
+        progress: Progress | None = None,
+    ) -> None:
+        """Reads MCAP files one after another. A file is closed before the next one is opened.
 
         Args:
             paths: The files.
+            read_file: Function that is called with the path of each file and its reader, from
+                which no message has been read yet.
             progress: Function that is called with the number of bytes read so far and the total
                 number of bytes of all files.
-
-        Yields:
-            The reader of each file, from which no message has been read yet.
 
         Raises:
             LogError: A file cannot be read, or is not an MCAP file.
@@ -308,7 +310,7 @@ class McapReader:
         for path in paths:
             file_progress = shift_progress(progress, bytes_before, total_bytes)
             with reading(path) as stream:
-                yield cls(stream, str(path), file_progress)
+                read_file(path, cls(stream, str(path), file_progress))
             bytes_before += path.stat().st_size
 
     @property

@@ -47,7 +47,7 @@ __all__ = [
     "PRIVATE_KEY",
     "add_keys",
     "create_keys",
-    "read_foreign_permissions",
+    "MemberKeys",
     "read_member_keys",
     "renew_keys",
     # Messages and their encoding
@@ -146,9 +146,9 @@ if TYPE_CHECKING:
         HERE,
         MEMBERS,
         PRIVATE_KEY,
+        MemberKeys,
         add_keys,
         create_keys,
-        read_foreign_permissions,
         read_member_keys,
         renew_keys,
     )
@@ -228,8 +228,8 @@ else:
             "host_names": "check_hosts",
             "known_sites": "make_site_known stop_at_once",
             "member_keys": (
-                "AUTHORITY CERTIFICATE HERE MEMBERS PRIVATE_KEY add_keys create_keys "
-                "read_foreign_permissions read_member_keys renew_keys"
+                "AUTHORITY CERTIFICATE HERE MEMBERS MemberKeys PRIVATE_KEY add_keys "
+                "create_keys read_member_keys renew_keys"
             ),
             "membership": "Epoch EventPublisher LateSites describe_member new_boot",
             "messages": (

@@ -32,7 +32,6 @@ from .clock import Clock
 from .default_endpoints import DefaultEndpoints
 from .host_names import UnknownHost, check_hosts, find_endpoint_addresses
 from .known_sites import find_known_endpoints
-from .session_members import SessionMembers
 from .zenoh_bus import RouterSilent, ZenohBus, read_zenoh_file
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, merge_settings
 
@@ -497,6 +496,8 @@ def _query_sites(
     Raises:
         SessionError: No member with a scenario replies in time.
     """
+    from .session_members import SessionMembers  # takes time: it loads NumPy
+
     members = SessionMembers(bus, clock, session)
     for info in members.find(stopped=stopped, timeout_s=timeout_s):
         try:

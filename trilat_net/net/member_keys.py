@@ -40,6 +40,7 @@ from ..files import (
     describe_write_error,
     make_folder,
     open_regular,
+    read_foreign_permissions,
     stage_output,
     write_whole,
 )
@@ -85,17 +86,17 @@ class MemberKeys(NamedTuple):
         ends: Expiry time of the keys, in UTC. The certificate remains valid for another
             `STOPPING_TIME`, so that the keys can still be used to stop arms.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
+        folder: Folder that contains the keys.
         hosts: Names and addresses under which other members can reach this member. Connections
             to any other address fail.
-        folder: Folder that contains the keys.
     """
 
     member: str
     members: tuple[str, ...]
     ends: datetime.datetime
     settings: dict[str, Any]
+    folder: Path
     hosts: tuple[str, ...] = ()
-    folder: Path = Path()
 
     def list_risks(self) -> Iterator[str]:
         """Yields who else could use the keys on this machine, and the remedy for each risk."""
@@ -109,18 +110,6 @@ class MemberKeys(NamedTuple):
                 f"the authority's key {authority} should not be on this machine, because it "
                 "can create keys for anybody; keep it elsewhere"
             )
-
-
-def read_foreign_permissions(path: Path) -> int:
-    """Returns the permission bits that a file grants to its group and to all other users.
-
-    A file that contains a secret should grant none. Returns 0 on Windows, which uses access
-    control lists instead.
-
-    Args:
-        path: The file.
-    """
-    return 0 if os.name == "nt" else path.stat().st_mode & 0o077
 
 
 def create_keys(

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from ..analysis import Timeline, link_summary
 from ..errors import count_nouns
 from ..execution import LogCheckReport
-from ..log import Log, LogCheckResult, Recovery
+from ..log import CheckReport, Log, LogCheckResult, Recovery
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MOST_LINES = 12
@@ -277,16 +277,23 @@ def _limit_lines(lines: list[str]) -> list[str]:
     return [*lines[:MOST_LINES], f"and {more} more of this kind: see summary.json"]
 
 
-def compose_verification(report: LogCheckReport) -> Iterator[Block]:
+def compose_checks(report: CheckReport) -> Iterator[Block]:
     """Yields the results of the log checks for the user, one line per check.
-
-    If all checks passed, the notable facts of the run follow.
 
     Args:
         report: Results of the checks.
     """
     for finding in report.findings:
         yield MarkedText("", f"{finding.check}: {finding.text}", failed=not finding.passed)
+
+
+def compose_verification(report: LogCheckReport) -> Iterator[Block]:
+    """Yields the results of the log checks, and the notable facts of a run that passed them.
+
+    Args:
+        report: Results of the checks.
+    """
+    yield from compose_checks(report)
     if report.passed:
         yield from format_run_lines(report.log)
 

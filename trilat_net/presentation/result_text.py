@@ -231,6 +231,7 @@ Block = str | MarkedText | TextTable
 
 _COMPOSERS = {
     "Certificate": "certificate_text:compose_certificate",
+    "CheckReport": "log_text:compose_checks",
     "LinearAnalysis": "linear_text:compose_linear",
     "Log": "log_text:compose_log",
     "LogCheckReport": "log_text:compose_verification",

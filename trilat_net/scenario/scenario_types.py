@@ -32,7 +32,7 @@ from ..core import (
 )
 from ..errors import ScenarioError, suggest_nearest
 from ..fields import Frozen
-from ..laws import LawSettings, LawSituation
+from ..laws import LawSettings, LawSituation, StabilityCondition
 from ..own_code import CodeKey, ImportedLaw, LoggedUserLaw, list_named_code
 from ..recorded_change import SiteOrder
 from ..records import NS_PER_S, Layout
@@ -264,15 +264,14 @@ class Scenario(Frozen, frozen=True, dict=True):
             ticks_grow: True if the discrete-time loop is known to be unstable. The lines about
                 satisfied conditions then mention this.
         """
-        conditions = {}
+        owners: dict[tuple[str, StabilityCondition], list[str]] = {}
         for name, law, situation in self.law_situations():
             condition = law.condition(situation)
             if condition:
-                conditions[name] = (law.tag, condition)
+                owners.setdefault((law.tag, condition), []).append(name)
         verdicts = {True: "holds", False: "does not hold", None: "is undecided"}
         lines = []
-        for tag, condition in dict.fromkeys(conditions.values()):
-            sites = [name for name, owned in conditions.items() if owned == (tag, condition)]
+        for (tag, condition), sites in owners.items():
             verdict = verdicts[condition.holds]
             line = f"condition of {tag} at {', '.join(sites)} {verdict}: {condition.text}"
             if ticks_grow and condition.holds:

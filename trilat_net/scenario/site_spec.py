@@ -362,7 +362,9 @@ class SiteSpec(Frozen, frozen=True):
             problem = self._find_assumed_limit(arm, key)
             if problem is not None:
                 return problem
-        return self.find_jump_problem()
+        if self.on_stale.action != "glide":
+            return self.describe_jump()
+        return None
 
     def _find_assumed_limit(self, arm: ArmModel, key: str) -> KeyProblem | None:
         """Returns the problem that a limit of a real robot comes from a default, if it does.
@@ -395,16 +397,15 @@ class SiteSpec(Frozen, frozen=True):
             f"{alternative if arm.chain is not None else ''}",
         )
 
-    def find_jump_problem(self) -> KeyProblem | None:
+    def describe_jump(self) -> KeyProblem:
         """Returns why the reference of a real robot may jump when a peer falls silent.
 
-        A jump would move the robot suddenly, so the stale rule must be "glide".
+        A jump would move the robot suddenly, so the stale rule must be "glide". The site has
+        another rule.
 
         Returns:
-            The key of the stale rule and the problem, or None if the rule is "glide".
+            The key of the stale rule, and the problem.
         """
-        if self.on_stale.action == "glide":
-            return None
         return KeyProblem(
             "on_stale.action",
             f"is {self.on_stale.action!r}, but an external arm needs 'glide', so that its site "

@@ -388,12 +388,10 @@ def _check_limits(scenario: Scenario, name: str) -> None:
 
     for key in ("q_min_rad", "q_max_rad"):
         if getattr(site.limits, key) is not None and site.on_stale.action != "glide":
-            jump_problem = site.find_jump_problem()
-            if name in scenario.outside and jump_problem is not None:
-                raise ScenarioError(  # the limits of a real robot must stay
-                    jump_problem.problem,
-                    path=f"sites.{name}.{jump_problem.key}",
-                    source=scenario.name,
+            if name in scenario.outside:  # the limits of a real robot must stay
+                jump = site.describe_jump()
+                raise ScenarioError(
+                    jump.problem, path=f"sites.{name}.{jump.key}", source=scenario.name
                 )
             raise ScenarioError(
                 "applies only with on_stale.action = 'glide', but the action is "

@@ -271,6 +271,3 @@ def _compare_with_range(
         margin=distance / half_width if half_width else None,
         value=measured.most if is_single_value else None,
     )
-
-
-# Packages that compute the results, by their keys in the provenance of a log.

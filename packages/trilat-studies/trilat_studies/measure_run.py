@@ -487,6 +487,7 @@ class _MeasuredRun:
         )
 
 
+# Packages that compute the results, by their keys in the provenance of a log.
 _VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
 
 

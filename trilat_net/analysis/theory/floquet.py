@@ -834,6 +834,7 @@ class SampledLoop:
     def __init__(
         self, conditions: OperatingConditions, uses: SamplesInUse | None = None
     ) -> None:
+        assert not conditions.has_forms  # a law with a linear form has none in ticks
         self._conditions = conditions
         self._uses = uses or SamplesInUse.predict(conditions)
         self._rates_hz = [site.rate_hz for site in conditions.sites]

@@ -434,12 +434,13 @@ class Transparency(NamedTuple):
         free = evaluate_free(w_rad_s)
         clamped = evaluate_clamped(w_rad_s)
 
+        port_joints = loop.port_joints
         transparencies = []
         for n, port in enumerate(ports):
             transparency = Transparency(
                 operator_site=at,
                 other_site=of,
-                joint=loop.port_joints[port],
+                joint=port_joints[port],
                 w_rad_s=w_rad_s,
                 free=1.0 / free[:, n, n],
                 clamped=1.0 / clamped[:, n, n],

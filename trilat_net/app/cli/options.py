@@ -661,8 +661,9 @@ class Reach(NamedTuple):
         """
         from ..running_session import RunningSession
 
+        name = check_session_name(name)
         connection = self.resolve(operates=operates, stops=stops)
-        return RunningSession(check_session_name(name), connection)
+        return RunningSession(name, connection)
 
 
 class LawFileOptions(NamedTuple):

@@ -57,7 +57,7 @@ TimedMessages = tuple[int, int, TopicMessages]
 def _write(
     log: Log,
     path: Path,
-    written: Written = lambda _: None,
+    written: Written,
     *,
     names: str = NAMINGS[0],
 ) -> None:

@@ -25,8 +25,8 @@ from . import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
 """Standard deviation, at least 1 microsecond since delays are integers in microseconds."""
-_US_PER_S = 1_000_000
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
+_US_PER_S = 1_000_000
 
 
 def _normal_density(x: float) -> float:

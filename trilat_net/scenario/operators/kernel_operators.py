@@ -352,6 +352,7 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
 
 HandMode = Literal["tip", "joint", "force"]
 HAND_MODES = get_args(HandMode)
+"""Modes of a live hand: what it prescribes, see `LiveHand.mode`."""
 
 
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):

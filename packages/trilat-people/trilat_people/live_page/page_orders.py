@@ -634,7 +634,7 @@ class OrderDesk:
         for site in sites:
             # A pending release would let the arm move again right after the stop.
             self._pending.pop((site, RELEASE), None)
-            self._send_request(site, topics.STOP, request)
+            self._send_request(site, request)
 
     def _release(self, order: _ReleaseArms, sites: Collection[str], source: str) -> None:
         """Queues requests to release stopped arms, or to reset arms after a fault.
@@ -669,17 +669,17 @@ class OrderDesk:
         if is_replacement or len(self._pending) < MAX_PENDING:
             self._pending[site, subject] = request
 
-    def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
+    def _send_request(self, site: str, request: ChangeRequest) -> None:
         """Sends a request to a site. The reply is received by `poll`.
 
-        For example, a request may change the delay of a link or stop an arm. Only one request
-        at a time waits for its reply.
+        For example, a request may change the delay of a link or stop an arm. Stops have a
+        channel of their own. On each channel, only one request at a time waits for its reply.
 
         Args:
             site: Name of the site.
-            channel: Channel for changes or for stops.
             request: The request.
         """
+        channel = topics.STOP if request.order == "stop" else topics.SET
         self._open_requests[site, channel] = self._members.request_change(site, request)
 
     def mark(self, site: str, text: str) -> None:
@@ -719,7 +719,7 @@ class OrderDesk:
             waits_for_reply = (site, topics.SET) in self._open_requests
             if not waits_for_reply:
                 del self._pending[site, subject]
-                self._send_request(site, topics.SET, request)
+                self._send_request(site, request)
 
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
