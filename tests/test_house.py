@@ -48,8 +48,8 @@ MOST_WORDS = 8
 LONG_TEST_NAMES = 5
 """Names of tests with more words, all of them in tests/golden; this number only falls."""
 INTERFACE_LIMITS = {  # part: how many of its names other parts import
-    "kernel": 182,
-    "session": 154,
+    "kernel": 185,
+    "session": 155,
     "analysis": 51,
     "app": 45,
     "studies": 9,
