@@ -20,13 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core import (
-    HandCommand,
-    MotionLimits,
-    Site,
-    SiteArrays,
-    tick_ns,
-)
+from trilat_net.core import HandCommand, MotionLimits, Site, SiteArrays, tick_ns
 from trilat_net.errors import SessionError, WireError, count_nouns
 from trilat_net.net import Clock, HandMessage, HandViewMessage, Inbox, PeerSeen, decode, encode
 from trilat_net.scenario import ArmModel, HandPlayer, HandSite, LiveHand

@@ -13,11 +13,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from trilat_net.core import (
-    LifeAlarm,
-    describe_mode,
-    tick_ns,
-)
+from trilat_net.core import LifeAlarm, describe_mode, tick_ns
 from trilat_net.errors import count_nouns
 from trilat_net.log import compute_task_errors, count_skipped_ticks
 from trilat_net.net import MODE_WORDS, EventPublisher

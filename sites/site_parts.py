@@ -14,14 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from trilat_net.core import (
-    CoreChange,
-    PlantState,
-    Site,
-    SiteSetup,
-    TickInput,
-    tick_ns,
-)
+from trilat_net.core import CoreChange, PlantState, Site, SiteSetup, TickInput, tick_ns
 from trilat_net.errors import LawFailed, WireError
 from trilat_net.net import (
     Bus,

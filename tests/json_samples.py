@@ -8,12 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import trilat_net as tn
-from tests.experiments import (
-    REACH,
-    answer_form,
-    write_hurried_pair,
-    write_protocol,
-)
+from tests.experiments import REACH, answer_form, write_hurried_pair, write_protocol
 from tests.json_outline import TABLE, gather_types
 from tests.sites.visits import ping_publishers, ping_sites
 from trilat_net.results import Result

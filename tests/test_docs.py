@@ -11,22 +11,11 @@ from typing import get_args
 import pytest
 from trilat_people.devices import haply_inverse3, spacemouse
 from trilat_studies.bench import bench_plan, bench_results, bench_run
-from trilat_studies.sweep import (
-    margin_search,
-    sweep_cell,
-    sweep_plan,
-    sweep_run,
-)
+from trilat_studies.sweep import margin_search, sweep_cell, sweep_plan, sweep_run
 from trilat_studies.tuning import candidate, search_space, tuning_plan
 
 from recorder import backfill, record_process, site_reception
-from sites import (
-    change_server,
-    code_watchdog,
-    external_arm,
-    retransmit_buffer,
-    site_end,
-)
+from sites import change_server, code_watchdog, external_arm, retransmit_buffer, site_end
 from trilat_net.analysis import (
     arm_rows,
     delay_period,

@@ -19,11 +19,7 @@ from scipy.optimize import brentq
 from scipy.stats import uniform
 from trilat_studies.sweep.sweep_cell import CellClass, classify_cell
 from trilat_studies.tuning.candidate import CandidateScore
-from trilat_studies.tuning.search_space import (
-    SEARCH_SPACES,
-    ModelInformation,
-    SearchSpace,
-)
+from trilat_studies.tuning.search_space import SEARCH_SPACES, ModelInformation, SearchSpace
 
 import trilat_net
 from tests.analysis.ages_in_use import compute_ordered_moments, newest_wins
@@ -35,11 +31,7 @@ from tests.theory import delay_equations, energy
 from tests.theory.figures_of_runs import find_value, measure_run
 from tests.theory.loops import RODS
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance
-from trilat_net.analysis.theory import (
-    LinearAnalysis,
-    find_equilibrium,
-    iterate_linear_edges,
-)
+from trilat_net.analysis.theory import LinearAnalysis, find_equilibrium, iterate_linear_edges
 from trilat_net.analysis.theory.port_analysis import PortAnalysis
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario

@@ -7,12 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.core.chain_references import chain_references
-from trilat_net.analysis.arm_rows import (
-    HANGING_RAD,
-    ArmRows,
-    ChainArmRows,
-    PlanarArmRows,
-)
+from trilat_net.analysis.arm_rows import HANGING_RAD, ArmRows, ChainArmRows, PlanarArmRows
 from trilat_net.analysis.base_parameters import (
     find_base_parameters,
     find_consistent_links,

@@ -10,11 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.analysis.twins.envelope_trend import (
-    FLOOR_RAD,
-    EnvelopeFit,
-    EnvelopeTrend,
-)
+from trilat_net.analysis.twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend
 
 Array = NDArray[np.float64]
 

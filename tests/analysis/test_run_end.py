@@ -9,13 +9,7 @@ import pytest
 import trilat_net
 from tests.analysis.builders import make_diverged_log
 from tests.log.builders import replace_fields, rewrite_log
-from trilat_net.analysis.run_end import (
-    NO_BUCKETS,
-    EndBehaviour,
-    RunEnd,
-    RunTrace,
-    Stability,
-)
+from trilat_net.analysis.run_end import NO_BUCKETS, EndBehaviour, RunEnd, RunTrace, Stability
 from trilat_net.core.step.ticks import BUCKETS_PER_S
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log

@@ -8,10 +8,7 @@ from hypothesis import strategies as st
 from tests.analysis.builders import make_run
 from trilat_net.analysis.aligned import AlignedRecords
 from trilat_net.analysis.arm_rows import PlanarArmRows
-from trilat_net.analysis.torque_sources import (
-    SourceRows,
-    TorqueSplit,
-)
+from trilat_net.analysis.torque_sources import SourceRows, TorqueSplit
 from trilat_net.core.arms import exogenous
 from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource, torque_source_rows
 

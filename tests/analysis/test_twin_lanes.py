@@ -9,10 +9,7 @@ import pytest
 import trilat_net as tn
 from tests.execution.circling_hand import CirclingHand
 from trilat_net.analysis.twins import twin_runs
-from trilat_net.analysis.twins.twin_runs import (
-    Push,
-    Twins,
-)
+from trilat_net.analysis.twins.twin_runs import Push, Twins
 from trilat_net.core.lanes import twin_lanes
 from trilat_net.execution.virtual import SimulatedLog
 from trilat_net.scenario import Scenario, load_scenario

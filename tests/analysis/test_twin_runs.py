@@ -9,11 +9,7 @@ import pytest
 import trilat_net as tn
 from tests.certificate.adversaries import p_d, two_pairs
 from trilat_net.analysis.twins.twin_growth import TwinGrowth
-from trilat_net.analysis.twins.twin_runs import (
-    LARGEST,
-    Push,
-    Twins,
-)
+from trilat_net.analysis.twins.twin_runs import LARGEST, Push, Twins
 from trilat_net.errors import NotRepeatable, UsageError
 from trilat_net.scenario import Scenario, load_scenario
 

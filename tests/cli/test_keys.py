@@ -16,11 +16,7 @@ from trilat_net.app.running_session import hand, session
 from trilat_net.errors import LogRefused, TrilatError, UsageError
 from trilat_net.net import member_keys
 from trilat_net.net.arm_client import ArmClient, SwitchClient
-from trilat_net.net.member_keys import (
-    MEMBERS,
-    create_keys,
-    read_member_keys,
-)
+from trilat_net.net.member_keys import MEMBERS, create_keys, read_member_keys
 
 MEMBERS_MADE = ("m1", "m2", "s", "recorder", "operator", "router", "bridge")
 

@@ -18,13 +18,7 @@ from tests.core.builders import (
 from trilat_net.core.links.channel import LOST
 from trilat_net.core.links.delay import DelayKind, LinkModel
 from trilat_net.core.step.site_step import Site
-from trilat_net.core.step.ticks import (
-    Arrival,
-    TickInput,
-    TickRecord,
-    first_tick_at,
-    tick_ns,
-)
+from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord, first_tick_at, tick_ns
 
 TICKS = 500
 PUSHED = ("uniform", "ar1", "trace", "measured", "bursts", "copies", "in order", "play-out")

@@ -18,12 +18,7 @@ from tests.core.builders import (
     make_channel,
 )
 from tests.core.philox_reference import philox_in_integers
-from trilat_net.core.links.delay import (
-    MAX_DELAY_US,
-    LinkModel,
-    clamp_delay_us,
-    trace_delay_us,
-)
+from trilat_net.core.links.delay import MAX_DELAY_US, LinkModel, clamp_delay_us, trace_delay_us
 from trilat_net.core.links.philox import link_key
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (

@@ -16,11 +16,7 @@ from tests.core.builders import (
 from tests.scenario.builders import planar_task_text, six_joint_text
 from trilat_net.core.links.delay import LinkModel
 from trilat_net.core.links.link import AHEAD_LIMIT_S, calendar_pages
-from trilat_net.core.step.site_arrays import (
-    MAX_LINKS_BYTES,
-    CalendarSizer,
-    SiteArrays,
-)
+from trilat_net.core.step.site_arrays import MAX_LINKS_BYTES, CalendarSizer, SiteArrays
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import CoreChange, TickInput
 from trilat_net.errors import ScenarioError

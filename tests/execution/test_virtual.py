@@ -16,10 +16,7 @@ from tests.log.builders import edit_log_bytes, make_log, make_log_bytes, open_by
 from trilat_net import simulate
 from trilat_net.core.step.ticks import Arrival, TickRecord
 from trilat_net.execution import virtual
-from trilat_net.execution.virtual_comparison import (
-    compare_with_virtual,
-    find_absent_samples,
-)
+from trilat_net.execution.virtual_comparison import compare_with_virtual, find_absent_samples
 from trilat_net.execution.virtual_network import PromptNetwork
 from trilat_net.log.log_reader import Log
 from trilat_net.log.message_identity import compute_virtual_boot

@@ -17,12 +17,7 @@ from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
 from trilat_net.files import Extra
-from trilat_net.log.data_tables import (
-    UNIT_SUFFIXES,
-    Column,
-    Table,
-    read_field_docs,
-)
+from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, Table, read_field_docs
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
 

@@ -18,13 +18,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tests.cli.running import trilat
-from tests.log.builders import (
-    drop_records,
-    edit_log_bytes,
-    make_log,
-    make_log_bytes,
-    write_log,
-)
+from tests.log.builders import drop_records, edit_log_bytes, make_log, make_log_bytes, write_log
 from tests.log.hostility import make_chunk as packed_chunk
 from tests.log.split_logs import (
     Message,

@@ -23,11 +23,7 @@ from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.ros2.ros2_messages import stack_signals
-from trilat_net.log.ros2.viz_channels import (
-    VizChannels,
-    decimate_min_max,
-    offer_views,
-)
+from trilat_net.log.ros2.viz_channels import VizChannels, decimate_min_max, offer_views
 from trilat_net.log.view_rates import FULL_RATE_HZ
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, LinkStats, State

@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from tests.net.free_endpoints import find_free_endpoints
 from tests.net.manual_clock import ManualClock
 from trilat_net.errors import SessionError, UsageError
-from trilat_net.net.connection import (
-    Connection,
-)
+from trilat_net.net.connection import Connection
 from trilat_net.net.default_endpoints import DefaultEndpoints
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.net.zenoh_config import ZenohFile

@@ -17,10 +17,7 @@ from trilat_net.core.step.site_setup import Layout
 from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.presentation import log_text
-from trilat_net.presentation.log_text import (
-    MOST_LINE_CHARACTERS,
-    format_run_lines,
-)
+from trilat_net.presentation.log_text import MOST_LINE_CHARACTERS, format_run_lines
 from trilat_net.presentation.page_summary import render_alarms
 from trilat_net.presentation.result_text import TextTable
 

@@ -10,10 +10,7 @@ from tests.unit_arm import make_unit_scenario
 from trilat_net.app.cli.options import list_laws
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.describe import (
-    ScenarioDifference,
-    describe_scenario,
-)
+from trilat_net.scenario.describe import ScenarioDifference, describe_scenario
 from trilat_net.scenario.named_files import SHIPPED_FOLDER
 from trilat_net.scenario.rest_bounds import find_rest_bounds
 from trilat_net.scenario.value_text import describe_value

@@ -13,12 +13,7 @@ from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource
 from trilat_net.core.links.delay import LinkModel
 from trilat_net.core.step.site_setup import Gains, Law, StaleAction, StaleRule
 from trilat_net.errors import ScenarioError
-from trilat_net.scenario import (
-    list_shipped,
-    load_scenario,
-    parse_scenario,
-    read_template,
-)
+from trilat_net.scenario import list_shipped, load_scenario, parse_scenario, read_template
 from trilat_net.scenario.override import ScenarioOverrides
 from trilat_net.scenario.scenario_reader import read_shipped
 

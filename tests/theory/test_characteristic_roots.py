@@ -10,10 +10,7 @@ from scipy.special import lambertw
 
 from tests.theory.loops import compute_residual, make_loop, roots_within
 from trilat_net.analysis.theory import characteristic_roots
-from trilat_net.analysis.theory.characteristic_roots import (
-    ChebyshevGrid,
-    Spectrum,
-)
+from trilat_net.analysis.theory.characteristic_roots import ChebyshevGrid, Spectrum
 
 
 @pytest.mark.parametrize("E", [None, np.array([1.0, 0.0])])

@@ -14,11 +14,7 @@ from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.theory import LinearAnalysis
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
 from trilat_net.core.links.dominance import DominanceMatrix
-from trilat_net.laws.conditions import (
-    COMMON_MOTION_SHARE,
-    LawSituation,
-    StabilityCondition,
-)
+from trilat_net.laws.conditions import COMMON_MOTION_SHARE, LawSituation, StabilityCondition
 from trilat_net.scenario import load_scenario
 
 LAB = [[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]]

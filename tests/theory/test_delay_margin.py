@@ -10,10 +10,7 @@ from hypothesis import strategies as st
 from tests.theory.loops import make_loop
 from trilat_net.analysis.theory import find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
-from trilat_net.analysis.theory.delay_margin import (
-    MAX_COMMON_DELAY_S,
-    DelayMargin,
-)
+from trilat_net.analysis.theory.delay_margin import MAX_COMMON_DELAY_S, DelayMargin
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import load_scenario

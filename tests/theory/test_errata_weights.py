@@ -11,9 +11,7 @@ from scipy.optimize import linprog
 
 from tests.execution.builders import make_shipped_trajectories
 from tests.theory.energy import compute_balance
-from trilat_net.analysis.dominance_history import (
-    compute_lyapunov_weights,
-)
+from trilat_net.analysis.dominance_history import compute_lyapunov_weights
 from trilat_net.core.arms.exogenous import (
     TorqueKind,
     TorqueSource,

@@ -13,11 +13,7 @@ from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import find_equilibrium, floquet
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
-from trilat_net.analysis.theory.floquet import (
-    CoupledTicks,
-    SampledLoop,
-    SamplesInUse,
-)
+from trilat_net.analysis.theory.floquet import CoupledTicks, SampledLoop, SamplesInUse
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import Scenario, load_scenario
 

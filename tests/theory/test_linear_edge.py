@@ -13,11 +13,7 @@ from scipy.linalg import eigvalsh
 from scipy.optimize import brentq
 
 from tests.theory.loops import Array
-from trilat_net.analysis.theory import (
-    LinearAnalysis,
-    find_equilibrium,
-    iterate_linear_edges,
-)
+from trilat_net.analysis.theory import LinearAnalysis, find_equilibrium, iterate_linear_edges
 from trilat_net.analysis.theory.equilibrium import predict_equilibrium
 from trilat_net.analysis.theory.linear_edge import (
     ASSUMED_EQUILIBRIUM_REMARK,

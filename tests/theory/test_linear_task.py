@@ -9,11 +9,7 @@ from tests.core.chain_references import ARMS
 from tests.scenario.builders import planar_task_text, posed_task_text
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
-from trilat_net.analysis.theory import (
-    LinearAnalysis,
-    find_equilibrium,
-    iterate_linear_edges,
-)
+from trilat_net.analysis.theory import LinearAnalysis, find_equilibrium, iterate_linear_edges
 from trilat_net.analysis.theory.characteristic_roots import Spectrum, find_moving_part
 from trilat_net.analysis.theory.equilibrium import find_mean_pose
 from trilat_net.analysis.theory.floquet import SampledLoop

@@ -14,10 +14,7 @@ from tests.execution.builders import make_log_with_commands, run_fused
 from trilat_net.analysis.delay_period import DelayPeriod, find_burst_interval_s
 from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import RunEnd
-from trilat_net.analysis.theory.loop_roots import (
-    find_log_roots,
-    find_run_roots,
-)
+from trilat_net.analysis.theory.loop_roots import find_log_roots, find_run_roots
 from trilat_net.analysis.timeline import Timeline
 from trilat_net.scenario import Scenario, load_scenario
 

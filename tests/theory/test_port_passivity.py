@@ -14,9 +14,7 @@ from trilat_net.analysis.theory.port_passivity import (
     find_least_eigenvalue,
     weight_response,
 )
-from trilat_net.analysis.theory.port_response import (
-    build_admittance,
-)
+from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.errors import UsageError
 
 POSITIVE = st.floats(0.1, 10.0)

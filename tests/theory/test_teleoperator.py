@@ -16,10 +16,7 @@ from trilat_net.analysis.theory.port_analysis import (
     linearise_teleoperator,
 )
 from trilat_net.analysis.theory.port_passivity import Passivity
-from trilat_net.analysis.theory.port_response import (
-    build_admittance,
-    evaluate_transfer,
-)
+from trilat_net.analysis.theory.port_response import build_admittance, evaluate_transfer
 from trilat_net.scenario import Scenario, load_scenario
 
 BARE: dict[str, Any] = {

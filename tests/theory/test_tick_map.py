@@ -12,10 +12,7 @@ from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.analysis.theory import find_equilibrium
 from trilat_net.analysis.theory.characteristic_roots import Spectrum
-from trilat_net.analysis.theory.floquet import (
-    SampledLoop,
-    discretise_zero_order_hold,
-)
+from trilat_net.analysis.theory.floquet import SampledLoop, discretise_zero_order_hold
 from trilat_net.analysis.theory.linear_loop import LinearLoop
 from trilat_net.analysis.theory.operating_point import OperatingConditions
 from trilat_net.scenario import Scenario, load_scenario

@@ -25,23 +25,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import LogError, count_nouns
-from ..log import (
-    SESSION,
-    Log,
-    McapReader,
-    Progress,
-    SiteLog,
-    open_log,
-)
+from ..log import SESSION, Log, McapReader, Progress, SiteLog, open_log
 from ..records import NS_PER_S
 from ..results import JsonObject, Result, finite_or_none
 from ..scenario import END_WINDOW_S
-from .link_summary import (
-    ONE_WAY_SCHEMA_VERSION,
-    ClockSummary,
-    LinkSummary,
-    ValueStatistics,
-)
+from .link_summary import ONE_WAY_SCHEMA_VERSION, ClockSummary, LinkSummary, ValueStatistics
 from .site_signals import (
     SETTLED_ERROR_RAD,
     operator_displacement,

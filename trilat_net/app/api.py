@@ -379,11 +379,7 @@ def view(
         LogError: The log cannot be read.
     """
     from ..log.ros2 import write_rviz_config
-    from ..presentation import (
-        ViewerOptions,
-        open_rerun,
-        write_foxglove_layout,
-    )
+    from ..presentation import ViewerOptions, open_rerun, write_foxglove_layout
 
     paths = [Path(file) for file in files]
     if viewer is not None:

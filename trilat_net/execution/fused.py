@@ -33,11 +33,7 @@ from ..core import (
 from ..errors import ScenarioError, count_nouns
 from ..log import Log, UnwrittenLog
 from ..records import NS_PER_S
-from ..scenario import (
-    HandPlayer,
-    PlantPlayer,
-    Scenario,
-)
+from ..scenario import HandPlayer, PlantPlayer, Scenario
 
 _BLOCK_TICKS = 4096
 """Interval at which the records of `FusedRun.simulate_log` are copied, in ticks of the fastest

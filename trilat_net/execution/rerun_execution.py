@@ -37,17 +37,8 @@ from ..scenario import (
     load_scenario,
     parse_scenario,
 )
-from .resumption import (
-    ReceivedMotion,
-    RecordedInputs,
-    find_recorded_hand,
-    make_arrival,
-)
-from .verification import (
-    PROGRESS_EVERY,
-    RecordDifference,
-    equal_record,
-)
+from .resumption import ReceivedMotion, RecordedInputs, find_recorded_hand, make_arrival
+from .verification import PROGRESS_EVERY, RecordDifference, equal_record
 from .virtual_network import Deliveries
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]

@@ -22,14 +22,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from .. import process
-from ..core import (
-    TAKEN,
-    CoreChange,
-    PlantState,
-    Site,
-    TickInput,
-    describe_mode,
-)
+from ..core import TAKEN, CoreChange, PlantState, Site, TickInput, describe_mode
 from ..errors import CodeFailed, count_nouns
 from ..hooks import find_hook
 from ..log import (

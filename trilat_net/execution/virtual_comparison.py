@@ -27,11 +27,7 @@ from ..log import Finding, Log, Progress, SiteLog
 from ..records import NS_PER_S, TickRecord
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
-from .verification import (
-    PROGRESS_EVERY,
-    RecordDifference,
-    equal_record,
-)
+from .verification import PROGRESS_EVERY, RecordDifference, equal_record
 from .virtual_network import Deliveries, Network, RecordedNetwork
 
 

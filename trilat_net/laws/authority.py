@@ -19,12 +19,7 @@ import numpy as np
 
 from ..core import Array, Gains, Law, LawInput, compiled
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
-from .conditions import (
-    LawSituation,
-    LinearForm,
-    LinearSituation,
-    StabilityCondition,
-)
+from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 

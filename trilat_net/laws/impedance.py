@@ -26,13 +26,7 @@ import numpy as np
 
 from ..core import Array, Gains, Law, LawContext, LawInput, compiled
 from ..fields import NotNegativeJoints, PositiveJoints
-from .conditions import (
-    ArmLoad,
-    LawSituation,
-    LinearForm,
-    LinearSituation,
-    StabilityCondition,
-)
+from .conditions import ArmLoad, LawSituation, LinearForm, LinearSituation, StabilityCondition
 from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningRun, TuningSite
 
 MOST_HANDS = 4

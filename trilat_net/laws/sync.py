@@ -23,14 +23,7 @@ import numpy as np
 from ..core import Array, Gains, Law, LawContext, LawInput, compiled, regressor
 from ..fields import NotNegativeParameters, Parameters, PositiveJoints
 from .conditions import LawSituation, StabilityCondition
-from .interface import (
-    ADAPTATION,
-    CONVERGENCE,
-    DAMPING,
-    ControlLaw,
-    TuningRun,
-    TuningSite,
-)
+from .interface import ADAPTATION, CONVERGENCE, DAMPING, ControlLaw, TuningRun, TuningSite
 
 
 @compiled

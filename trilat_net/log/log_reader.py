@@ -26,22 +26,12 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from ..errors import (
-    LogError,
-    UnknownName,
-    UsageError,
-    count_nouns,
-    suggest_nearest,
-)
+from ..errors import LogError, UnknownName, UsageError, count_nouns, suggest_nearest
 from ..hooks import find_hook
 from ..own_code import LawFiles, allow_logged_code
 from ..package_names import describe_missing_library
 from ..results import Result
-from ..scenario import (
-    FAILED_HAND,
-    PictureDelay,
-    TracePoint,
-)
+from ..scenario import FAILED_HAND, PictureDelay, TracePoint
 from .accounted_log import AccountedLog
 from .accounting import describe_unknown_ends
 from .data_tables import EVENTS_TABLE, SITE_TABLE_KINDS, Table

@@ -35,12 +35,7 @@ from ..records import NS_PER_S
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .membership import (
-    Epoch,
-    EventPublisher,
-    LateSites,
-    Membership,
-)
+from .membership import Epoch, EventPublisher, LateSites, Membership
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 from .wire import read_messages

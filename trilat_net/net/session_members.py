@@ -26,13 +26,7 @@ from .bus import RING_CAPACITY, Bus, Inbox
 from .clock import Clock
 from .messages import Event, Info, LinkStats, State
 from .pinging import RepeatedQuery
-from .requests import (
-    BACKFILL_MESSAGES,
-    Backfill,
-    BackfillRequest,
-    ChangeReply,
-    ChangeRequest,
-)
+from .requests import BACKFILL_MESSAGES, Backfill, BackfillRequest, ChangeReply, ChangeRequest
 from .wire import decode, encode, read_messages
 
 _POLL_NS = 5_000_000

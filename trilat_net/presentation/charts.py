@@ -30,13 +30,7 @@ from ..scenario import Scenario
 from . import plot_signals, style
 from .appearance import DARK_SITE_COLOURS, list_site_colours
 from .figures import age_and_lateness, arm_poses
-from .page_data import (
-    Chart,
-    DistributionChart,
-    HistogramChart,
-    PageData,
-    TimeChart,
-)
+from .page_data import Chart, DistributionChart, HistogramChart, PageData, TimeChart
 from .page_leaders import SlaveLead
 from .plot_signals import decimate
 

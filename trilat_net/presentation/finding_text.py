@@ -11,14 +11,7 @@ Invariant:
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from . import (
-    decision_text,
-    end_text,
-    observed_text,
-    remark_text,
-    twin_text,
-    verdict_text,
-)
+from . import decision_text, end_text, observed_text, remark_text, twin_text, verdict_text
 
 _DESCRIBERS: dict[type, Callable[[Any], str]] = {
     **decision_text.DESCRIBERS,

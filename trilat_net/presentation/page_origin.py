@@ -16,19 +16,9 @@ from markupsafe import Markup
 from ..errors import count_nouns, join_words
 from ..log import Log, describe_unknown_ends
 from ..results import JsonObject
-from ..scenario import (
-    Scenario,
-    ScenarioDifference,
-    list_shipped,
-    load_scenario,
-)
+from ..scenario import Scenario, ScenarioDifference, list_shipped, load_scenario
 from .html_templates import render_macro
-from .page_html import (
-    render_details,
-    render_facts,
-    render_folds,
-    render_section,
-)
+from .page_html import render_details, render_facts, render_folds, render_section
 from .page_timeline import describe_dominance
 
 _STATED_KEYS = ("seed", "duration_s")

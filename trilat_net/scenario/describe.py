@@ -17,12 +17,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ..core import (
-    ROW_SUM_TOLERANCE,
-    ChainJoint,
-    IntArray,
-    link_key,
-)
+from ..core import ROW_SUM_TOLERANCE, ChainJoint, IntArray, link_key
 from ..errors import count_nouns
 from ..records import NS_PER_S
 from .arms import TASK_AXES

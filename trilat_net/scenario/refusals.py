@@ -23,12 +23,7 @@ import msgspec
 
 from ..errors import ScenarioError
 from ..fields import WITHOUT_QUOTES, TomlTable, reword_problem
-from .distributions import (
-    DISTRIBUTION_FORM,
-    Distribution,
-    StatedDistribution,
-    dotted_key,
-)
+from .distributions import DISTRIBUTION_FORM, Distribution, StatedDistribution, dotted_key
 from .key_checks import (
     describe_unknown_key,
     field_names,

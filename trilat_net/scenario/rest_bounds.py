@@ -19,12 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core import (
-    REST_RATE_1_S,
-    Array,
-    ChainDynamics,
-    SiteSetup,
-)
+from ..core import REST_RATE_1_S, Array, ChainDynamics, SiteSetup
 from .arms import Arm, ArmModel
 from .scenario_types import Scenario
 

@@ -19,11 +19,7 @@ from ..fields import Frozen, TomlTable
 from ..own_code import parse_classes
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm
 from .distributions import Draws, has_distribution
-from .key_checks import (
-    VectorCounts,
-    check_choice,
-    field_names,
-)
+from .key_checks import VectorCounts, check_choice, field_names
 from .laws import LAWS
 from .link_inertia import LinkInertia
 from .link_tables import complete_link

@@ -18,11 +18,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from ..core import (
-    MAX_LINKS_BYTES,
-    DominanceMatrix,
-    SiteArrays,
-)
+from ..core import MAX_LINKS_BYTES, DominanceMatrix, SiteArrays
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable
 from ..laws import LawSettings

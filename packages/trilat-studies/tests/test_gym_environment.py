@@ -12,13 +12,7 @@ import polars as pl
 import pytest
 from gymnasium.utils.env_checker import check_env
 from study_builders import assert_same_bits
-from trilat_studies.gym_environment import (
-    ENV_ID,
-    Judgement,
-    ReachTask,
-    Scene,
-    TeleoperationEnv,
-)
+from trilat_studies.gym_environment import ENV_ID, Judgement, ReachTask, Scene, TeleoperationEnv
 
 import trilat_net as tn
 from trilat_net.analysis.shared_slave import SharedSlave

@@ -6,10 +6,7 @@ from typing import Any
 import pytest
 from trilat_studies.sweep import plan_sweep
 from trilat_studies.sweep.fixed_gains import describe_fixed_gains
-from trilat_studies.tuning.search_space import (
-    ModelInformation,
-    SearchSpace,
-)
+from trilat_studies.tuning.search_space import ModelInformation, SearchSpace
 from trilat_studies.tuning.tuning_plan import plan_tuning
 
 import trilat_net as tn

@@ -16,25 +16,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import msgspec
 import numpy as np
 
-from trilat_net.analysis import (
-    LogMetrics,
-    Metric,
-    RunEnd,
-)
+from trilat_net.analysis import LogMetrics, Metric, RunEnd
 from trilat_net.core import Array, compute_fingerprint
 from trilat_net.errors import ScenarioError
-from trilat_net.execution import (
-    FusedRun,
-    SimulatedLog,
-    find_absent_samples,
-)
+from trilat_net.execution import FusedRun, SimulatedLog, find_absent_samples
 from trilat_net.log import Log, collect_provenance
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import (
-    ALL_SITES_QUANTITIES,
-    Expect,
-    Scenario,
-)
+from trilat_net.scenario import ALL_SITES_QUANTITIES, Expect, Scenario
 
 from .record_batches import BATCH_RECORDS, BatchedRun, RecordBatch, run_in_batches
 from .run_statistics import LinkAge, Range, SiteStats, WindowStats

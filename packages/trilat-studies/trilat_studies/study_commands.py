@@ -505,13 +505,7 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
     Raises:
         UsageError: A law is not part of the study.
     """
-    from .bench.bench_plan import (
-        GAINS_FILE,
-        STUDIES,
-        read_gains,
-        tune_laws,
-        write_gains,
-    )
+    from .bench.bench_plan import GAINS_FILE, STUDIES, read_gains, tune_laws, write_gains
 
     laws_by_form = STUDIES[study].laws
     all_laws = {law for form_laws in laws_by_form.values() for law in form_laws}

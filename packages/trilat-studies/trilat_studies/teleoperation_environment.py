@@ -21,12 +21,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    NamedTuple,
-    Protocol,
-)
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from msgspec.structs import replace
@@ -36,13 +31,7 @@ from trilat_net.errors import UsageError, count_nouns
 from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.files import Extra
 from trilat_net.log import expand_poses
-from trilat_net.scenario import (
-    HAND_MODES,
-    HandPlayer,
-    HandSite,
-    Scenario,
-    load_scenario,
-)
+from trilat_net.scenario import HAND_MODES, HandPlayer, HandSite, Scenario, load_scenario
 
 from .reachable_places import can_reach
 

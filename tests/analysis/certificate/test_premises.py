@@ -31,9 +31,7 @@ from trilat_net.analysis.certificate.premise_quantities import (
     Premise,
     PremiseQuantities,
 )
-from trilat_net.analysis.certificate.premises import (
-    RunFacts,
-)
+from trilat_net.analysis.certificate.premises import RunFacts
 from trilat_net.analysis.torque_sources import WallEnergy
 from trilat_net.analysis.twins import envelope_trend
 from trilat_net.core.step.vectors import Array

@@ -14,12 +14,7 @@ from tests.net.parties import answer_info
 from tests.net.waiting import drained
 from tests.recorder.play.logs import read_session_payloads, write_event_log
 from trilat_net.app.play.message_source import MessageSource
-from trilat_net.app.play.play_process import (
-    LINGER_NS,
-    Playback,
-    PlaybackSummary,
-    PlayOptions,
-)
+from trilat_net.app.play.play_process import LINGER_NS, Playback, PlaybackSummary, PlayOptions
 from trilat_net.app.play.player import PlayProgress
 from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, SessionReader
 from trilat_net.errors import SessionError

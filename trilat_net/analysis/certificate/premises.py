@@ -31,11 +31,7 @@ from ...core import DominanceMatrix
 from ...log import Log
 from ...net import HALTED_MODES
 from ..aligned import Bools
-from ..dominance_history import (
-    PeerLoss,
-    compute_lyapunov_weights,
-    find_kd_scales,
-)
+from ..dominance_history import PeerLoss, compute_lyapunov_weights, find_kd_scales
 from ..following import TaskFollowing
 from ..row_reductions import any_in_rows
 from ..timeline import Timeline

@@ -22,12 +22,7 @@ import numpy as np
 from ...core import Array, CoreChange, DominanceMatrix
 from ...net import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
-from ..aligned import (
-    RECORD_COLUMNS,
-    RESUMING_S,
-    AlignedRecords,
-    PeerTrajectory,
-)
+from ..aligned import RECORD_COLUMNS, RESUMING_S, AlignedRecords, PeerTrajectory
 from ..dominance_history import DominanceHistory, DominancePlan
 from .energy_balance import (
     EnergyBalance,

@@ -39,12 +39,7 @@ from .functional_judgements import JUDGEMENTS
 from .observed_energy import ObservedEnergy
 from .premise_quantities import Premise
 from .premises import RunFacts
-from .verdict_facts import (
-    Evidence,
-    FunctionalRise,
-    StabilityFinding,
-    StabilityVerdict,
-)
+from .verdict_facts import Evidence, FunctionalRise, StabilityFinding, StabilityVerdict
 
 _REFUTING_FINDINGS = ("negative", "broken")
 

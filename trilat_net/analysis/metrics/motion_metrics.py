@@ -27,11 +27,7 @@ from ...results import JsonObject
 from ...scenario import END_WINDOW_S, Scenario
 from .. import site_signals
 from ..aligned import AlignedRecords, Bools, PeerTrajectory, find_common_rows
-from ..arm_rows import (
-    ArmRows,
-    PlanarArmRows,
-    build_arm_rows,
-)
+from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows
 from ..base_parameters import find_base_parameters, find_consistent_links
 from ..file_overview import describe_site_health
 from ..run_view import RunView

@@ -20,16 +20,7 @@ from ..aligned import AlignedRecords, find_common_rows
 from ..dominance_history import RAMP_TIME_TOLERANCE_S, DominanceHistory
 from ..run_view import RunView, SiteRun
 from ..shared_slave import SharedSlave, UserShares
-from .measures import (
-    USERS,
-    Metric,
-    MetricValues,
-    Quantity,
-    measures,
-    peak,
-    rms,
-    unavailable,
-)
+from .measures import USERS, Metric, MetricValues, Quantity, measures, peak, rms, unavailable
 
 JACKKNIFE_BLOCKS = 8
 """Number of blocks of ticks that the jackknife leaves out, one at a time."""

@@ -38,15 +38,7 @@ from ..delay_period import DelayPeriod, find_burst_interval_s
 from ..run_end import RunEnd, find_coupled_sites
 from ..torque_sources import VirtualWall
 from .envelope_trend import EnvelopeFit, EnvelopeTrend
-from .twin_runs import (
-    LEAST_PUSH,
-    MOST_PUSH,
-    PUSH_RAD,
-    SMALLEST,
-    Push,
-    TwinPath,
-    Twins,
-)
+from .twin_runs import LEAST_PUSH, MOST_PUSH, PUSH_RAD, SMALLEST, Push, TwinPath, Twins
 
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""

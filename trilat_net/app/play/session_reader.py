@@ -28,14 +28,7 @@ from trilat_net.net import topics
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, parse_embedded
 
-from ...log import (
-    SCENARIO,
-    SESSION,
-    SITE_CHANNELS,
-    ChannelFilter,
-    McapReader,
-    Progress,
-)
+from ...log import SCENARIO, SESSION, SITE_CHANNELS, ChannelFilter, McapReader, Progress
 from ...net import number_message
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
 

@@ -25,14 +25,7 @@ from ..step.site_arrays import SiteArrays
 from ..step.site_setup import Layout
 from ..step.ticks import tick_ns
 from ..step.vectors import Array
-from .live_hand import (
-    SILENCE_NS,
-    HandCommand,
-    HandMemory,
-    HandRules,
-    HandStep,
-    glide,
-)
+from .live_hand import SILENCE_NS, HandCommand, HandMemory, HandRules, HandStep, glide
 
 PROGRAM = 1
 """Source recorded for each action of a hand program."""

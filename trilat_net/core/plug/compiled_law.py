@@ -37,12 +37,7 @@ from ..step.vectors import Array, Row, RowArray
 from .law_channel import SentVector
 from .law_view import PlainLaw, update_law_view
 from .plugged import call_address, digest_sibling_sources, find_address
-from .user_law import (
-    LawInput,
-    LawResults,
-    PeerView,
-    SiteLaw,
-)
+from .user_law import LawInput, LawResults, PeerView, SiteLaw
 
 CHECKED: Any = {"_nrt": False, "boundscheck": True}
 """Compiler options for laws: invalid indices and divisions by zero raise exceptions."""

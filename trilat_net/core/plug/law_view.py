@@ -23,13 +23,7 @@ from ..step.site_setup import SiteSetup
 from ..step.ticks import tick_ns
 from ..step.vectors import Array, Row, RowArray
 from .law_channel import SentVector
-from .user_law import (
-    LawInput,
-    LawVector,
-    PeerView,
-    SiteLaw,
-    UserLaw,
-)
+from .user_law import LawInput, LawVector, PeerView, SiteLaw, UserLaw
 
 
 @leaf

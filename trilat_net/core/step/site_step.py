@@ -36,13 +36,7 @@ from .kernel import (
     sense_stages,
     site_tick,
 )
-from .site_arrays import (
-    MAX_CHANGES,
-    MAX_RAMPS,
-    CalendarSizer,
-    SiteArrays,
-    TickBuffers,
-)
+from .site_arrays import MAX_CHANGES, MAX_RAMPS, CalendarSizer, SiteArrays, TickBuffers
 from .site_setup import SiteSetup
 from .ticks import (
     MAX_ARRIVALS,

@@ -17,12 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ...analysis import (
-    Timeline,
-    certify_run,
-    settling_time_of_all_s,
-    site_signals,
-)
+from ...analysis import Timeline, certify_run, settling_time_of_all_s, site_signals
 from ...core import Array
 from ...errors import UsageError
 from ...log import Log

@@ -24,14 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ...analysis import (
-    SMALLEST,
-    EnvelopeTrend,
-    PushedTwins,
-    PushGrowth,
-    RunEnd,
-    TwinGrowth,
-)
+from ...analysis import SMALLEST, EnvelopeTrend, PushedTwins, PushGrowth, RunEnd, TwinGrowth
 from ...core import BUCKETS_PER_S, Array
 from ...execution import FusedRun
 from ...log import Log

@@ -26,13 +26,7 @@ from trilat_net.files import digest_file, make_folder, make_results_folder, writ
 from trilat_net.presentation import Block, TextTable
 from trilat_net.results import Result
 from trilat_net.scenario import parse_embedded
-from trilat_net.work import (
-    Progress,
-    RunJournal,
-    WorkerPool,
-    Workers,
-    encode_csv,
-)
+from trilat_net.work import Progress, RunJournal, WorkerPool, Workers, encode_csv
 
 from .completion_times import COMPLETION, find_median, is_completed
 from .protocol import Choices, ExperimentPlan, ExperimentProtocol, PlannedTrial

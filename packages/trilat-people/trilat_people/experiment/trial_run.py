@@ -22,11 +22,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from trilat_net.analysis import (
-    AlignedRecords,
-    TorqueSplit,
-    build_arm_rows,
-)
+from trilat_net.analysis import AlignedRecords, TorqueSplit, build_arm_rows
 from trilat_net.core import Array
 from trilat_net.errors import LogError
 from trilat_net.execution import FusedRun, SimulatedLog, verify_log

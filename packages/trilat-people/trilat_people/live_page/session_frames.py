@@ -23,12 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.analysis import (
-    AlignedRecords,
-    TorqueSplit,
-    VirtualWall,
-    build_arm_rows,
-)
+from trilat_net.analysis import AlignedRecords, TorqueSplit, VirtualWall, build_arm_rows
 from trilat_net.core import Array, HandInForce, LifeAlarm
 from trilat_net.net import Event
 from trilat_net.presentation import describe_energy_obstacle

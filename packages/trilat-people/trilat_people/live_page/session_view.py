@@ -29,24 +29,9 @@ from recorder import AWAY_NS, GapRepair, InboundQueue
 from trilat_net.analysis import KEPT_S, RunningEnergy
 from trilat_net.core import TAKEN, LifeAlarm
 from trilat_net.errors import ScenarioError, WireError
-from trilat_net.net import (
-    Bus,
-    Clock,
-    Event,
-    Info,
-    LinkStats,
-    SessionMembers,
-    State,
-    topics,
-)
+from trilat_net.net import Bus, Clock, Event, Info, LinkStats, SessionMembers, State, topics
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import (
-    Change,
-    LinkTables,
-    PictureDelay,
-    Scenario,
-    parse_embedded,
-)
+from trilat_net.scenario import Change, LinkTables, PictureDelay, Scenario, parse_embedded
 
 LATE_S = 3.0
 """An observer joined late if the first record that it receives is later than this, in s."""

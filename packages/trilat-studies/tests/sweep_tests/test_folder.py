@@ -12,11 +12,7 @@ from hypothesis import strategies as st
 from study_builders import DAMPING, SHORT, make_cell_result, plan_quick_sweep
 from trilat_studies import measure_run
 from trilat_studies.sweep.sweep_cell import CellRun
-from trilat_studies.sweep.sweep_run import (
-    PLAN_FILE,
-    open_sweep_folder,
-    prepare_sweep_folder,
-)
+from trilat_studies.sweep.sweep_run import PLAN_FILE, open_sweep_folder, prepare_sweep_folder
 
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, UsageError

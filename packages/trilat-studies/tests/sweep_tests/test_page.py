@@ -19,10 +19,7 @@ from study_builders import (
     read_tables,
 )
 from trilat_studies.sweep.fixed_gains import describe_fixed_gains
-from trilat_studies.sweep.map_page import (
-    CLASS_COLOURS,
-    MapReport,
-)
+from trilat_studies.sweep.map_page import CLASS_COLOURS, MapReport
 from trilat_studies.sweep.map_plane import CELL_CLASSES, MapPlane
 from trilat_studies.sweep.stability_map import MapLine, StabilityMap
 from trilat_studies.sweep.sweep_cell import CellClass

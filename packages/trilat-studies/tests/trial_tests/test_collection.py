@@ -12,12 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trilat_studies.expectations import ExpectationResult
 from trilat_studies.measure_run import RunMetrics
-from trilat_studies.record_batches import (
-    BATCH_RECORDS,
-    BatchedRun,
-    RecordBatch,
-    run_in_batches,
-)
+from trilat_studies.record_batches import BATCH_RECORDS, BatchedRun, RecordBatch, run_in_batches
 from trilat_studies.run_statistics import SiteStats, WindowStats
 
 import trilat_net

@@ -49,26 +49,14 @@ from trilat_net.errors import CodeFailed, UsageError
 from trilat_net.files import make_results_folder, refuse_link, write_whole
 from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario
-from trilat_net.work import (
-    Progress,
-    RunJournal,
-    WorkerPool,
-    Workers,
-)
+from trilat_net.work import Progress, RunJournal, WorkerPool, Workers
 
 from ..measure_run import describe_program
 from ..record_batches import RecordBatch, WholeRun
 from ..side_by_side import RunKind, prepare_kinds
 from ..study_folder import StudyFolder
 from ..tuning.candidate import TuningScenario
-from .bench_plan import (
-    SHORTER_REACH,
-    TASKS,
-    BenchCell,
-    BenchPlan,
-    Settings,
-    format_settings,
-)
+from .bench_plan import SHORTER_REACH, TASKS, BenchCell, BenchPlan, Settings, format_settings
 from .bench_results import BenchResults, BenchRun, name_run
 
 SLAVE = "s"

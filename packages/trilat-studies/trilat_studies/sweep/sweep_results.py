@@ -34,11 +34,7 @@ from trilat_net.work import MeanInterval, wilson_interval
 
 from ..run_commands import format_command
 from .result_table import ResultRow, ResultTable, StoredRows, encode_table
-from .sweep_cell import (
-    RUN_CLASSES,
-    CellClass,
-    CellResult,
-)
+from .sweep_cell import RUN_CLASSES, CellClass, CellResult
 from .sweep_plan import SweepPlan
 
 RESULTS_FILE = "results.csv"

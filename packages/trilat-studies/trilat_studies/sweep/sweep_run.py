@@ -38,12 +38,7 @@ from trilat_net.execution import FusedRun, SimulatedLog
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net import SystemClock
 from trilat_net.scenario import Scenario
-from trilat_net.work import (
-    Progress,
-    RunJournal,
-    WorkerPool,
-    Workers,
-)
+from trilat_net.work import Progress, RunJournal, WorkerPool, Workers
 
 from ..measure_run import describe_program
 from ..side_by_side import LANE_SITE_TICKS

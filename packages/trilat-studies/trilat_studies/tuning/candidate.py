@@ -54,12 +54,7 @@ from trilat_net.errors import CodeFailed, ScenarioError
 from trilat_net.laws import LawSettings, TuningRun
 from trilat_net.log import Log
 from trilat_net.records import NS_PER_S
-from trilat_net.scenario import (
-    END_WINDOW_S,
-    ExperimentText,
-    Scenario,
-    parse_embedded,
-)
+from trilat_net.scenario import END_WINDOW_S, ExperimentText, Scenario, parse_embedded
 from trilat_net.work import MeanInterval
 
 from ..record_batches import RecordBatch, WholeRun
