@@ -4,8 +4,8 @@ A log has one channel for each kind of message that a site or the recorder publi
 
 Invariant:
     - Messages are decoded when they are accessed, and only the fields that are asked for. A
-      record in which these are invalid raises an error that names the file. An invalid event or statistics message is skipped and reported in
-      `DecodedLog.unreadable`.
+      record in which these are invalid raises an error that names the file. An invalid event or
+      statistics message is skipped and reported in `DecodedLog.unreadable`.
     - Channels of other sessions and members are ignored.
 """
 
