@@ -10,6 +10,7 @@ from pathlib import Path
 import trilat_net as tn
 from tests.experiments import REACH, answer_form, write_hurried_pair, write_protocol
 from tests.json_outline import TABLE, gather_types
+from tests.sites.far_end import answering_far_end
 from tests.sites.visits import ping_publishers, ping_sites
 from trilat_net.results import Result
 
@@ -69,6 +70,7 @@ OTHERS: dict[str, Callable[[Path], list[Result]]] = {
     "ping --benchmark": lambda _: [
         tn.ping_benchmark("p_d_margin", duration_s=2),
         tn.ping_benchmark(EXTERNAL, duration_s=2),
+        _benchmark_far_end(),
     ],
 }
 SINES = [
@@ -79,6 +81,12 @@ SINES = [
     )
 ]
 HAND = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
+
+
+def _benchmark_far_end() -> Result:
+    """Returns the benchmark of a network whose far end is another program."""
+    with answering_far_end() as endpoint:
+        return tn.ping_benchmark("p_d_margin", duration_s=2, connect=[endpoint])
 
 
 def _analyse_hurried_pair(folder: Path) -> Result:

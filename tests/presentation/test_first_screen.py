@@ -72,7 +72,12 @@ def test_report_fits_screens_and_axe_finds_nothing(
 @needs_browser
 def test_arms_play_at_once_unless_motion_is_reduced(browser: Browser, tmp_path: Path) -> None:
     log = make_short_log("paper")
-    path, _ = write_report(log, tmp_path, certificate=Certificate.of_log(log))
+    path, _ = write_report(
+        log,
+        tmp_path,
+        certificate=Certificate.of_log(log),
+        wait_for_checks=lambda: CheckReport([]),
+    )
     for motion, label in (("no-preference", "stop"), ("reduce", "play")):
         with watched_page(browser, reduced_motion=motion) as watched:
             watched.page.goto(path.as_uri())

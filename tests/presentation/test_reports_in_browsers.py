@@ -226,7 +226,13 @@ def test_whole_report_with_its_certificate_is_drawn(
     log = VARIED[name]()
     twin = make_log_without_hands("paper") if name == "shipped paper" else None
     certificate = Certificate.of_log(log)
-    path, _ = write_report(log, tmp_path, certificate=certificate, twin=twin)
+    path, _ = write_report(
+        log,
+        tmp_path,
+        certificate=certificate,
+        twin=twin,
+        wait_for_checks=lambda: CheckReport([]),
+    )
     observed = certificate.observed
     twins = certificate.twins
     sections = [certificate.balance, observed and observed.curves, twins and twins.pushes]

@@ -45,7 +45,7 @@ def test_above_the_edge_a_margin_remains(calm: LinearAnalysis) -> None:
 def test_less_damping_than_the_edge_is_unstable() -> None:
     analysis = LinearAnalysis.compute("p_d_margin", ["control.d=0.9"], pose=(0.07, 0.23))
     assert analysis.verdict == "unstable"
-    assert "\nunstable: the slowest motion goes as exp(0.01" in str(analysis)
+    assert "\nunstable: the slowest motion goes as exp(0.01" in analysis.summary()
 
 
 def test_verdicts_follow_the_computed_loop(digital: LinearAnalysis) -> None:
@@ -72,9 +72,9 @@ def test_every_word_has_its_number(calm: LinearAnalysis) -> None:
         f"{first['re_per_s']:.4g}",
         f"{first['im_rad_s']:.4g}",
     )
-    assert facts["margin"]["words"] in str(calm)
+    assert facts["margin"]["words"] in calm.summary()
     zero_count = facts["continuous"]["zeros_by_structure"]
-    lines = str(calm).splitlines()
+    lines = calm.summary().splitlines()
     assert any(line.startswith(f"{zero_count} roots are zero by structure: ") for line in lines)
     assert lines[1].strip() == "all sites at (0.0700, 0.2300) rad"
     json.dumps(facts, allow_nan=False)
@@ -99,7 +99,7 @@ def test_several_rates_have_roots_over_periods() -> None:
         "unstable: the slowest motion goes as exp(0.1802 t / s) at 9.955 rad/s, as computed over the period "
         "of 0.1 s"
     )
-    assert verdict in str(analysis).splitlines()
+    assert verdict in analysis.summary().splitlines()
     assert any("ticks and delays decide" in note for note in analysis.notes)
     assert tabulate_roots(analysis).rows[0][0] == "0.1802"
     facts = analysis.to_dict()
@@ -112,7 +112,7 @@ def test_drawn_delays_state_their_roots_accuracy() -> None:
     assert analysis.sampled is not None
     assert analysis.sampled.deviation_per_s is not None
     phrase = f"over 30 s of the delays in use, +- {analysis.sampled.deviation_per_s:.1g} /s"
-    text = str(analysis)
+    text = analysis.summary()
     assert any(line.endswith(phrase) for line in text.splitlines())
     assert "mean delay in use on m2->m1" in text
 
@@ -125,7 +125,7 @@ def test_lasting_motions_are_separated_from_decaying() -> None:
     )
     assert (
         "\nat the edge: 2 motions keep their speed, and the slowest of the other motions goes as exp(-0."
-        in str(analysis)
+        in analysis.summary()
     )
 
 
