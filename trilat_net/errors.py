@@ -60,6 +60,8 @@ def _name_argument(match: re.Match[str]) -> str:
     if command:
         return str(command)
     name = _ARGUMENTS.get(option) or option.lstrip("-").replace("-", "_")
+    if option == "--law" and value == " FILE":  # the file of a user's law, not names of laws
+        name = "law"
     if option in _SWITCHES:
         return f"{name}=True"
     return f"{name}={value.strip()}" if value else name
