@@ -293,7 +293,7 @@ def test_open_rights_are_no_finding_on_windows(
     (folder / "m1" / "private.key").chmod(0o666)
     try:
         monkeypatch.setattr("trilat_net.net.member_keys.sys", SimpleNamespace(platform="win32"))
-        monkeypatch.setattr("trilat_net.net.member_keys.os", replace_os())
+        monkeypatch.setattr("trilat_net.files.os", replace_os())
         assert list_states(examine_machine(keys=folder / "m1").check_keys()) == ["ok"]
     finally:
         (folder / "m1" / "private.key").chmod(0o600)

@@ -240,13 +240,18 @@ class Scenario(Frozen, frozen=True, dict=True):
             )
             yield name, self.controls[n], situation
 
+    @property
+    def is_digital(self) -> bool:
+        """True if a controller holds the torque of a tick until the next tick."""
+        return self.scheme == "digital"
+
     def _find_hold_time(self) -> float:
         """Returns how long the torque of an arm is held constant, in s.
 
         This is the control period for the integration scheme "digital", and 0 for other
         schemes. NaN if the control loops have different rates.
         """
-        if self.scheme != "digital":
+        if not self.is_digital:
             return 0.0
         periods_s = {1.0 / site.rate_hz for site in self.sites.values()}
         return periods_s.pop() if len(periods_s) == 1 else math.nan

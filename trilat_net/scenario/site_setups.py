@@ -35,7 +35,7 @@ def build_site_setup(scenario: "Scenario", site: str) -> SiteSetup:
     return SiteSetup(
         name=site,
         rate_hz=spec.rate_hz,
-        digital=scenario.scheme == "digital",
+        digital=scenario.is_digital,
         gains=scenario.gains(site),
         theta=arm.theta,
         g_m_s2=spec.arm.g_m_s2,

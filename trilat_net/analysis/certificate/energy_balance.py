@@ -291,7 +291,7 @@ class SiteEnergy:
                 dominance=dominance(site, site_records.t_s),
                 peers=peers,
                 torque=TorqueSplit.of_records(site_records, scenario),
-                digital=scenario.scheme == "digital",
+                scheme=scenario.scheme,
                 common=common_axes,
             )
             energies[site] = SiteEnergy(

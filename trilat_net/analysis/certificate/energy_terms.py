@@ -248,8 +248,8 @@ class SiteMotion:
         peers: Motion of the peers as received by the site, in the order of the dominance
             factors.
         torque: External torque on the arm, divided into operator and environment.
-        digital: True if the controller holds the torque of a tick until the next tick. False if
-            it extrapolates the torque (scheme "second_order").
+        scheme: "digital" if the controller holds the torque of a tick until the next tick,
+            "second_order" if the controller extrapolates the torque.
         common: 1 for each coordinate that all sites follow, and 0 for the others. Empty if all
             sites follow all coordinates.
     """
@@ -259,7 +259,7 @@ class SiteMotion:
     dominance: DominanceHistory
     peers: Mapping[str, DelayedPeer]
     torque: TorqueSplit
-    digital: bool = False
+    scheme: str = "second_order"
     common: tuple[float, ...] = ()
 
     @cached_property
@@ -312,7 +312,7 @@ class SiteMotion:
         Y'r is evaluated at the start of the period or averaged over its ends, in the same way
         as the law did. The shape is (K - 1, P).
         """
-        if self.digital:
+        if self.scheme == "digital":
             return self.Yr[:-1]
         Yr_left = self.Yr[:-1]
         Yr_right = self.Yr[1:]
@@ -796,7 +796,8 @@ class SiteMotion:
         records = self.records
         c = self.constants
         ends = self.ends
-        held_torque = hold_torque(records.tau, c.tau_limit, digital=self.digital)
+        digital = self.scheme == "digital"
+        held_torque = hold_torque(records.tau, c.tau_limit, digital=digital)
         applied_torque = held_torque[:-1]
         tau_right, Yr_right = _evaluate_before_jump(self)
 

@@ -88,7 +88,7 @@ def _held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
         tau_right = tau[1:]
         return 0.5 * (tau_left + tau_right)
     tau_limit = np.asarray(spec.limits.tau_limit_nm)
-    digital = scenario.scheme == "digital"
+    digital = scenario.is_digital
     held = hold_torque(tau, tau_limit, digital=digital)
     return held[:-1]
 

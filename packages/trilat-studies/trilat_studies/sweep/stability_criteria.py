@@ -325,7 +325,7 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
         cover the scenario for another reason.
     """
     delays_s = _list_delays_s(scenario)
-    if scenario.scheme != "digital" or delays_s is None:
+    if not scenario.is_digital or delays_s is None:
         return None
 
     site_excess = []
