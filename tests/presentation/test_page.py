@@ -22,7 +22,6 @@ from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import Certificate
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import CheckReport, Finding
-from trilat_net.presentation import plot_signals
 from trilat_net.presentation.figures.registry import (
     FIGURES,
     list_drawable_figures,
@@ -220,7 +219,7 @@ def test_nearly_empty_logs_have_reports(sites, tmp_path):
 def test_error_chart_names_its_floor(name):
     log = make_short_log(name)
     _, data = render_page(log)
-    errors = [plot_signals.largest_magnitude(log[site].e).min() for site in log.sites]
+    errors = [site_signals.largest_magnitude(log[site].e).min() for site in log.sites]
     chart = next(c for c in data["charts"] if c["section"] == "overview")
     assert chart["title"] == "Largest error |e| by site"
     assert chart["note"].startswith("Dashed: 0.01 rad.")

@@ -152,6 +152,22 @@ class JointError(NamedTuple):
         return max(known, key=lambda error: error.value, default=None)
 
 
+def largest_magnitude(values: Array) -> Array:
+    """Returns the largest absolute value of each row, for example over the joints of an arm.
+
+    For example, the row [0.1, -0.3] gives 0.3.
+
+    Args:
+        values: The array, shape (K, n).
+
+    Returns:
+        The largest absolute values, shape (K,). Zeros if the rows have no entries.
+    """
+    magnitudes = np.abs(values)
+    largest: Array = magnitudes.max(axis=1, initial=0.0)
+    return largest
+
+
 def largest_remaining_error(site_log: SiteLog) -> Array:
     """Returns the largest error from each record to the end of the run.
 
@@ -163,8 +179,7 @@ def largest_remaining_error(site_log: SiteLog) -> Array:
     Returns:
         Largest error, shape (K,), which never increases.
     """
-    errors = np.abs(joint_errors(site_log))
-    largest = errors.max(axis=1, initial=0.0)
+    largest = largest_magnitude(joint_errors(site_log))
     reversed_largest = largest[::-1]
     from_the_end = np.maximum.accumulate(reversed_largest)
     return from_the_end[::-1]

@@ -173,8 +173,8 @@ class FusedRun(CompiledRun):
                 "t_ns": ticks * NS_PER_S // scenario.sites[name].rate_hz,
                 "used": dict(zip(scenario.peers(name), used.T, strict=True)),
             }
-            for field, place in scenario.layout(name).columns().items():
-                site_columns[field] = rows[:, place]
+            for field, column_range in scenario.layout(name).columns().items():
+                site_columns[field] = rows[:, column_range]
             columns[name] = site_columns
         return UnwrittenLog(scenario, columns)
 

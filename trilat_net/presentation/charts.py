@@ -228,7 +228,7 @@ class ChartBuilder:
             The sentence, preceded by a space. Empty if no site has such small errors.
         """
         for site in self._log.sites:
-            largest = plot_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
+            largest = site_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
             if (largest < _LEAST_DRAWN).any():
                 return f" Errors below {_LEAST_DRAWN:g} {unit} are drawn at this value."
         return ""

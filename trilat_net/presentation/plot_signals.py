@@ -18,22 +18,6 @@ from ..core import Array
 from ..log import Ints, Log, SiteLog
 
 
-def largest_magnitude(values: Array) -> Array:
-    """Returns the largest absolute value of each row, for example over the joints of an arm.
-
-    For example, the row [0.1, -0.3] gives 0.3.
-
-    Args:
-        values: The array, shape (K, n).
-
-    Returns:
-        The largest absolute values, shape (K,). Zeros if the rows have no entries.
-    """
-    magnitudes = np.abs(values)
-    largest: Array = magnitudes.max(axis=1, initial=0.0)
-    return largest
-
-
 def reference_angles(part: SiteLog) -> Array:
     """Returns the reference angles of an arm's joints, in rad.
 

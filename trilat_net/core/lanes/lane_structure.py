@@ -21,9 +21,28 @@ from .lane_laws import LaneLaw
 from .lane_rows import Constants
 
 SITE_CONSTANTS: tuple[str, ...] = (
-    *("rate_hz", "first", "digital", "law", "external", "ramps", "on_stale", "theta_known"),
-    *("needs_model", "remembered", "asked", "order", "skipped", "degrades", "regrouped"),
-    *("holds", "joints", "shared", "parameters", "task", "sent", "reason"),
+    "rate_hz",
+    "first",
+    "digital",
+    "law",
+    "external",
+    "ramps",
+    "on_stale",
+    "theta_known",
+    "needs_model",
+    "remembered",
+    "asked",
+    "order",
+    "skipped",
+    "degrades",
+    "regrouped",
+    "holds",
+    "joints",
+    "shared",
+    "parameters",
+    "task",
+    "sent",
+    "reason",
 )
 """Fields of a site's row that are equal in runs of one structure and constant in each run."""
 _CHANGED_BY_GLIDE = ("reason", "regrouped")

@@ -402,7 +402,7 @@ def _draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         lowest_drawn = SETTLED_ERROR_RAD
         highest_drawn = SETTLED_ERROR_RAD
         for site in log.sites:
-            errors = plot_signals.largest_magnitude(site_signals.joint_errors(log[site]))
+            errors = site_signals.largest_magnitude(site_signals.joint_errors(log[site]))
             drawn_errors = style.positive(errors)
             plot.trace(axes, site, drawn_errors)
             if errors.any():

@@ -57,17 +57,17 @@ class _Panel(NamedTuple):
 
 def _compute_largest_error(log: Log, site: str) -> Array:
     """Returns the largest error of any joint or task axis in each record, shape (K,)."""
-    return plot_signals.largest_magnitude(log[site].e)
+    return site_signals.largest_magnitude(log[site].e)
 
 
 def _compute_largest_speed(log: Log, site: str) -> Array:
     """Returns the largest speed of any joint in each record, shape (K,), in rad/s."""
-    return plot_signals.largest_magnitude(log[site].qd)
+    return site_signals.largest_magnitude(log[site].qd)
 
 
 def _compute_largest_torque(log: Log, site: str) -> Array:
     """Returns the controller's largest torque at any joint, shape (K,), in N m."""
-    return plot_signals.largest_magnitude(log[site].tau)
+    return site_signals.largest_magnitude(log[site].tau)
 
 
 def _compute_oldest_sample_ms(log: Log, site: str) -> Array:
