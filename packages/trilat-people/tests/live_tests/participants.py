@@ -58,8 +58,7 @@ LOOK = """([site, beyond_m]) => {
   const own = arms.byName[site], tip = frame.sites[site].points.at(-1);
   const box = own.canvas.getBoundingClientRect();
   if (!own.project) return found;
-  const slave = frame.sites[shown.target.site].points.at(-1);
-  const aim = shown.target.at.map((x, n) => tip[n] + x + (n ? 0 : beyond_m) - slave[n]);
+  const aim = shown.target.at.map((x, n) => x + (n ? 0 : beyond_m));
   const ratio = own.canvas.width / box.width;
   const px = (at) => { const [x, y] = own.project(at); return [box.left + x / ratio, box.top + y / ratio]; };
   return { ...found, tip: px(tip), aim: px(aim), held: Boolean(own.hold), graspable: own.graspable };
