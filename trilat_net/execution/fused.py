@@ -197,7 +197,10 @@ class FusedRun(CompiledRun):
             arms = ", ".join(sorted(scenario.external))
             return f"the reaction of the external arm of {arms} is not known"
         if scenario.user_laws and not own_laws:
-            return "the imported control laws may not run (permit them with --law FILE)"
+            return (
+                "the imported control laws may not run (permit them with --law FILE, in Python "
+                "with own_laws=True)"
+            )
         if set(log.executed_sites) != set(log.sites):
             return "in a rerun, the sites whose records were copied did not react"
         for name in log.sites:

@@ -461,7 +461,7 @@ def _explain_missing_gains(scenario: Scenario, site: str) -> str:
     if spec.user_law is not None:
         return (
             f"{spec.law_name} is known by its code only, which may not run here; "
-            "trilat linear and trilat certify --law FILE run it"
+            "trilat linear, trilat certify --law FILE and tn.certify(..., own_laws=True) run it"
         )
     others = (
         "adaptive, adaptive_box, p_d, pd_d, p_f and others have one, "
