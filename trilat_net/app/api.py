@@ -130,9 +130,9 @@ def verify(
             process simulates all arms and the network.
         min_coverage: Minimum fraction of each site's ticks (control periods) that must be
             compared for the check to pass.
-        resume_every: Restore the state of each site from the log every this many ticks. This
-            reveals any state of a user-written control law that is missing from the log. If 0,
-            the state is never restored.
+        resume_every: Interval, in ticks, at which the state of each site is restored from the
+            log. This reveals any state of a user-written control law that is missing from the
+            log. If 0, the state is never restored.
 
     Returns:
         The result of the comparison. Its property `passed` is True if all numbers match, enough
@@ -191,8 +191,8 @@ def twin(
 ) -> "PushedTwins":
     """Repeats a recorded run with small pushes at a given time, as `trilat twin` does.
 
-    A twin is a repeated run in which one quantity was changed by a small amount, the push. The
-    result shows how the difference between each twin and the run develops.
+    A twin is a repeated run in which the state received a small push. The result shows how the
+    difference between each twin and the run develops.
 
     >>> found = tn.twin(tn.simulate("two_sites", duration_s=4), at_s=1, push={"m.q1": 1e-6})
     >>> found.growth.pushes[0].rate_per_s < 0.0
@@ -204,12 +204,13 @@ def twin(
         push: Sizes by target, as in `{"m1.q1": 1e-6}`, with one twin per push. A target is a
             joint's angle, `m1.q1`, a joint's speed, `m1.qd1`, an estimate, `m1.theta1`, or
             several quantities in a random direction, `m1.q` or `q`. By default the pushes are
-            those of `certify`. If they are made at 0 s, their growth is judged as in `certify`.
-        delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+            those of `certify`. If these default pushes are made at 0 s, the growth of their
+            effects is judged as in `certify`.
+        delta: Range of sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
 
     Raises:
-        UsageError: There is no such target, time or range.
-        LogError: The log cannot be read, or cannot be executed again.
+        UsageError: A target does not exist, or the time or the range of sizes is invalid.
+        LogError: The log cannot be read, or its run cannot be repeated.
         CodeWithheld: The code of a law of the log may not be executed.
     """
     from ..analysis import PushedTwins
@@ -233,7 +234,7 @@ def metrics(log: AnyLog) -> LogMetrics:
         The metrics of the run, of each site and of each link, with their units.
 
     Raises:
-        LogError: The log cannot be read, or no site has a record in it.
+        LogError: The log cannot be read, or contains no records of any site.
     """
     log_of_run = _open(log)
     log_of_run.require_records()
@@ -308,10 +309,10 @@ def linear(
 
     Args:
         scenario: Name of a shipped scenario, path of a TOML file, TOML string, mapping of its
-            tables, or `Scenario`. Given a log, analyses the loop as it was at the end of the
-            run, after all commands.
+            tables, `Scenario`, or log. For a log, the loop is analysed as it was at the end of
+            the run, after all commands.
         set: Overrides of scenario settings, for example `{"control.d": 0.9}`.
-        pose: Joint angles of all sites, in rad. Default: the angles at the end of a run.
+        pose: Joint angles of all sites, in rad. Default: those at the end of the run.
         roots: Number of characteristic roots to compute (the complex exponents of the loop's
             modes).
         over: Ranges of settings to search for stability boundaries (values at which the
@@ -323,7 +324,7 @@ def linear(
         The analysis, including its verdict.
 
     Raises:
-        ScenarioError: The scenario is invalid, or has no linear loop.
+        ScenarioError: The scenario is invalid, or cannot be linearised.
         UsageError: Another argument is invalid.
     """
     from ..analysis import LinearAnalysis

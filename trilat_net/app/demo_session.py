@@ -104,8 +104,8 @@ def run_demo(
         scenario: The scenario to run.
         folder: Folder for the log and for the output of the processes.
         console: Terminal of the user.
-        attend: Function that attends to the session, for example by serving a web page, and may
-            end it. `None` if there is none.
+        attend: Function that watches the session, for example to serve a web page, and may end
+            the session. `None` if there is no such function.
         begins: Function that returns True once the session may begin. Until then, for at most
             `WAIT_S`, the sites wait for the recorder. The session begins a second or two later.
             If `None`, the session begins at once.
@@ -395,9 +395,9 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
     """Runs the starter process, from which the processes of a session are forked.
 
     Forked processes start quickly, because all modules are imported and all code is compiled.
-    The function stands in this module because the forks need most of its imports. As with
-    `os.fork`, it returns in every process: in each fork, which then runs its
-    command, and finally in the starter, after the requesting process has disappeared.
+    The function is in this module because the forks need most of the module's imports. As with
+    `os.fork`, it returns in every process: in each fork, which then runs its command, and
+    finally in the starter, after the requesting process has disappeared.
 
     Args:
         number: File descriptor of the pipe to the requesting process.

@@ -463,11 +463,12 @@ class MachineExamination:
             )
 
     def check_clock(self) -> Iterator[DoctorFinding]:
-        """Checks for `CLOCK_TEST_NS` whether the clocks of this machine run steadily.
+        """Checks whether the clocks of this machine run steadily.
 
-        The monotonic clock must not go backwards, and the time of day must not jump relative to
-        it. The finding also states the longest gap between two readings, which shows for how
-        long the operating system interrupts a process.
+        During a test of `CLOCK_TEST_NS`, the monotonic clock must not go backwards, and the
+        time of day must not jump relative to it. The finding also states the longest gap
+        between two readings, which shows for how long the operating system interrupts a
+        process.
 
         Yields:
             One finding about the clocks.
@@ -594,8 +595,8 @@ class MachineExamination:
     def check_rate() -> DoctorFinding:
         """Measures the highest rate, in Hz, at which a control loop is punctual here.
 
-        Each rate in `RATES_HZ`, such as 1000 Hz, is tried for `REHEARSAL_S`, until the loop
-        starts its periods on time.
+        The rates in `RATES_HZ`, such as 1000 Hz, are tried in turn, for `REHEARSAL_S` each,
+        until the loop starts its periods on time.
         """
         if not is_core_cached():
             return DoctorFinding(

@@ -112,7 +112,7 @@ class StatusRow(dict[str, str]):
         Args:
             name: Name of the site.
             t_s: Time of the pose, in s.
-            q: Joint angles in rad. Empty if the pose is also unknown.
+            q: Joint angles in rad. Empty if they are unknown.
         """
         row = cls(dict.fromkeys(_HEADINGS, ""), site=name)
         if q:

@@ -63,7 +63,10 @@ SIZE_FACTORS = (1, 4, 16)
 RATE_SHARES = (0.1, 1.0)
 """Rates of the messages, as fractions of the tick rate of the scenario."""
 DEFAULT_S = 24.0
-"""Duration of all cases together, in s. With three transports, 18 cases take 1.33 s each."""
+"""Default duration of all measurements together, in s.
+
+With three transports, 18 measurements take 1.33 s each.
+"""
 CONNECT_NS = 20_000_000_000
 """Longest wait for the far end, in ns."""
 MAX_LOST = 1e-3
@@ -153,7 +156,7 @@ class NearEnd:
     def wait_for_far_end(self) -> bool:
         """Waits until the far end can be reached.
 
-        Messages are sent repeatedly, because the connection may still be being set up.
+        Messages are sent repeatedly, because the connection may not be established yet.
 
         Returns:
             True once the far end has replied. False if it does not reply within `CONNECT_NS`.
@@ -491,7 +494,7 @@ class NetworkBenchmark(Result):
 
     Attributes:
         scenario: Name of the scenario.
-        duration_s: Total duration of all cases, in s.
+        duration_s: Total duration of all measurements, in s.
         needs: Requirements of the scenario.
         rows: Measurements, one row per message size, message rate and transport.
         judged: For each transport, the verdict on whether it is good enough; see
@@ -574,7 +577,7 @@ def ping_benchmark(
         scenario: Name of a shipped scenario, path of a TOML file, TOML string, mapping of its
             tables, or `Scenario`.
         set: Overrides of scenario settings, for example `{"link.model": "measured"}`.
-        duration_s: Total duration of all cases, in s.
+        duration_s: Total duration of all measurements, in s.
         connect: Endpoints on which `trilat ping --answer` listens. If `None`, a far end is
             started on this machine, for TCP, TLS and QUIC.
         keys: Folder with a site's keys, for encrypted endpoints.

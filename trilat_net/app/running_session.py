@@ -3,7 +3,7 @@
 A session is a set of processes (sites) that each run one arm and exchange the states of their
 arms over the network. `session` returns a `RunningSession`, whose methods send requests to the
 sites and return their replies. `hand` lets a program act as the operator of an arm. `start`
-starts a process of a session, as a terminal would.
+starts one of the session's processes, as a user would from a terminal.
 
 The commands `trilat stop`, `enable`, `reset`, `set`, `ping` and `hand` use the same functions.
 
@@ -521,10 +521,11 @@ class RunningSession:
         """Subscribes to the latest record of each site, as a context manager.
 
         With `as_site`, the records show what the user of that site sees: the latest record of
-        the site itself and, for each peer, the record of the sample that the site is currently
-        using. That sample is older than the peer's latest one, because the link delays it, or
-        because the scenario delays the picture (`[sites.NAME.view]`). A peer is missing if this
-        record was published before the subscription, or more than `STATES_KEPT` ticks ago.
+        the site itself and, for each peer, the record of the sample that the user currently
+        sees. That sample is older than the peer's latest one, because the link delays it, or
+        because the scenario delays the picture in which the user sees the other arms
+        (`[sites.NAME.view]`). A peer is missing if the record of that sample was published
+        before the subscription, or more than `STATES_KEPT` ticks ago.
 
         >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
         ...     find()["s"].q
@@ -542,12 +543,12 @@ class RunningSession:
     def mark(self, text: str) -> str:
         """Adds a text mark to the log at the current time.
 
-        For example, a user marks a remarkable event in order to find it in the log later. The
+        For example, a user can mark an unusual event in order to find it in the log later. The
         first site of the scenario that is present publishes the mark as an event, which the
         recorder stores.
 
         Args:
-            text: Content of the mark, for readers of the log.
+            text: Text of the mark, for people who read the log.
 
         Returns:
             The reply of the site, as a sentence.
@@ -572,9 +573,9 @@ class RunningSession:
             name: Name of the episode.
 
         Yields:
-            A function that states whether the episode has succeeded. If it is called several
-            times, the last call counts. If it is never called, the log only says that the
-            episode ended.
+            A function to be called with True if the episode has succeeded, otherwise with
+            False. If it is called several times, the last call counts. If it is never called,
+            the log only says that the episode ended.
         """
         judgements: list[bool] = []
         self.mark(f"episode {name} begins")
@@ -614,7 +615,7 @@ class RunningSession:
             def find() -> dict[str, float]:
                 """Returns the current weight with which the arm follows each peer, by name.
 
-                The current time is that of the latest record received from the site.
+                The weights are those at the time of the latest record received from the site.
                 """
                 nonlocal now_ns
                 for event in read_events():
@@ -686,7 +687,7 @@ def session(
 
 
 def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
-    """Starts a process of a session, as a terminal would.
+    """Starts one of a session's processes, as a user would from a terminal.
 
     The process runs until it ends by itself, or until the caller terminates it. The available
     commands are `trilat site`, `hand`, `record`, `router`, `replay`, `watch`, `live` and
@@ -716,7 +717,7 @@ def hand(
     source: str = "",
     timeout_s: float = 5.0,
 ) -> Iterator[Hand]:
-    """Lets a program move an arm of a live session, as its operator, as a context manager.
+    """Lets a program act as the operator of an arm in a live session, as a context manager.
 
     The arm is released at the end of the `with` block.
 
@@ -738,7 +739,7 @@ def hand(
         The connection to the arm.
 
     Raises:
-        SessionError: There is no such session, or it does not begin.
+        SessionError: The session does not exist, or does not begin in time.
         UsageError: The scenario does not allow a live operator at that arm, or an endpoint
             cannot be used.
     """

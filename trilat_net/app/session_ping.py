@@ -78,8 +78,8 @@ class PingReport(Result):
 class SessionPing:
     """A single measurement of a session's round-trip times and link delays.
 
-    Call `poll` repeatedly until `is_over` returns True, then call `report`. The measurement
-    takes no part in any control loop. It discovers the members by sending a query, measures
+    Call `poll` repeatedly until `is_over` returns True, then call `report`. The measurement is
+    not part of any control loop. It discovers the members by sending a query, measures
     round-trip times with pings, and reads the link delays from the statistics that the sites
     publish.
 

@@ -15,7 +15,7 @@ from ..scenario import Scenario
 
 
 class ShareHistory:
-    """Tracks how the dominance factors of an arm change over the time of a session.
+    """Tracks how the dominance factors of an arm change over the course of a session.
 
     A dominance factor is the weight with which the arm follows another arm. The scenario sets
     the initial factors and planned changes, and users may request more changes during the

@@ -60,8 +60,8 @@ class Push(NamedTuple):
             Otherwise the twin ends.
         largest: Difference beyond which the twin is moved closer to the run, in the unit of the
             field. Infinite to disable this.
-        direction: Number of the random direction in which all joints are pushed, from 1. 0 if
-            the joints were chosen in another way.
+        direction: Number of the random direction, from 1, if all joints are pushed together
+            because there are too few pushes for one per joint. Otherwise 0.
     """
 
     name: str
@@ -93,7 +93,7 @@ class Push(NamedTuple):
             at_s: Time of the push, in s after the epoch (the common start time).
 
         Raises:
-            UsageError: The scenario has no such target, or the size is out of range.
+            UsageError: The target does not exist in the scenario, or the size is out of range.
         """
         match = _TARGET.fullmatch(target)
         if match is None:
@@ -139,8 +139,8 @@ class Push(NamedTuple):
 
         - one push of all estimated parameters, if the control law of any site estimates
           parameters;
-        - up to three pushes of all joints in a random direction, with sizes around `PUSH_RAD`.
-          The sizes differ because growth may depend on the amplitude;
+        - up to three pushes of all joints in a random direction, with sizes of 1, 1e-3 and 1e3
+          times `PUSH_RAD`. The sizes differ because growth may depend on the amplitude;
         - one push per joint, because growth at a joint that does not act on the others is
           clearly visible only if that joint itself is pushed.
 
@@ -254,7 +254,7 @@ class Twins(NamedTuple):
     def of_scenario(
         cls, scenario: Scenario, pushes: Sequence[Push], duration_s: float
     ) -> "Twins":
-        """Simulates an experiment, and repeats it with small pushes to see whether they grow.
+        """Simulates an experiment, and repeats it to see if the effects of small pushes grow.
 
         The run and its twins (one per push) are simulated faster than real time.
 
@@ -358,7 +358,7 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
 
 
 LANE_SITE_TICKS = 100_000_000
-"""Number of site ticks from which the code that runs twins side by side is worth compiling.
+"""Least number of site ticks for which compiling the code for side-by-side twins pays off.
 
 Compilation takes about ten seconds. Once compiled, the code is used for any number of ticks.
 """

@@ -251,7 +251,8 @@ def sort_messages(
 
     Args:
         messages: The messages, in file order.
-        horizon_ns: Largest delay of a message in the file that is corrected, in ns of log time.
+        horizon_ns: Largest delay with which a message may appear in the file and still be put
+            in order, in ns of log time.
         step_ns: Duration of the part of the log that is sorted at a time, in ns.
         limit_bytes: Memory limit for buffered messages, in bytes. If it is exceeded, the
             earlier half is yielded at once.

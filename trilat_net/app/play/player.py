@@ -134,7 +134,7 @@ LATENESS_LIMIT_US = 100_000
 
 
 class LatenessHistogram:
-    """Histogram of how late messages were published after their deadlines, in us.
+    """Histogram of how long after their deadlines messages were published, in us.
 
     Percentiles can be computed from the counts at any time, without storing the lateness of
     every message. The bin width is 1 us.
@@ -175,9 +175,9 @@ class LatenessHistogram:
     def summary(self) -> Summary | None:
         """Computes the statistics of all messages counted so far, in us.
 
-        The p-th percentile is the smallest lateness up to which at least p percent of the
-        messages were counted. The test 100 * (messages with at most this lateness) >= p * (all
-        messages) uses integers and is therefore exact.
+        The p-th percentile is the smallest lateness that at least p percent of the messages do
+        not exceed. The test 100 * (messages with at most this lateness) >= p * (all messages)
+        uses integers and is therefore exact.
 
         Returns:
             Median, 99th percentile and maximum of the lateness, in us. `None` if no message was

@@ -155,7 +155,7 @@ _LAST = 1 << 61
 """Bound on times and numbers, so that wrong values in damaged files do not overflow."""
 NUMBERS_OF_A_START = 1 << 40
 """Number that is added to the event numbers of each further start of a site. Otherwise, the
-numbers would repeat, because each start numbers its events from 0.
+numbers would repeat, because events are numbered from 0 after each start.
 """
 
 
@@ -174,7 +174,7 @@ class PayloadHeader(msgspec.Struct):
 
     @staticmethod
     def decode(payload: bytes) -> "PayloadHeader":
-        """Decodes the fields of a message. They keep their defaults if that is not possible."""
+        """Decodes the fields of a message, or returns the defaults if it cannot be decoded."""
         try:
             return _decoder.decode(payload)
         except (ValueError, RecursionError):
@@ -279,7 +279,7 @@ class _PlayedChannel:
 
         - Records and statistics of a site are numbered by their control period (tick). A site
           that was started again continues these numbers.
-        - Events of a site are numbered from 0 in each start of the site. To distinguish the
+        - Events of a site are numbered from 0 after each start of the site. To distinguish the
           starts, a multiple of `NUMBERS_OF_A_START` is added.
         - Other messages have no number. Their time is used instead.
 
@@ -318,7 +318,7 @@ class SessionReader:
     """Reads the messages of a recorded session from its log files, for playback.
 
     Args:
-        paths: The files of the log. Several files are the parts of a session, in order.
+        paths: The files of the log. Several files must be parts of the same session, in order.
         selection: Which messages are played, by channel and time.
         progress: Function that is called periodically with the number of bytes read and the
             total number of bytes.

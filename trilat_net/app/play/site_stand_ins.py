@@ -365,8 +365,8 @@ class SiteStandIns:
         """Finds the replayed messages that a recorder requests again after missing them.
 
         The history and the recorder number events differently. A site numbers its events from 0
-        in each start, and so does the recorder. The history numbers them over all starts: it
-        adds `NUMBERS_OF_A_START` for each earlier start.
+        after each start, and so does the recorder. In the history, the numbers increase over
+        all starts: `NUMBERS_OF_A_START` is added for each earlier start.
 
         Args:
             site: Name of the site.

@@ -83,8 +83,8 @@ class ChainJoint(NamedTuple):
             `COULOMB_SPEED`.
         lower: Position of the lower stop, rad or m; -inf if there is no stop.
         upper: Position of the upper stop, rad or m; inf if there is no stop.
-        stop_stiffness: Stiffness of both stops, N m/rad or N/m.
-        stop_damping: Damping of both stops, N m s/rad or N s/m.
+        stop_stiffness: Stiffness of each stop, N m/rad or N/m.
+        stop_damping: Damping coefficient of each stop, N m s/rad or N s/m.
     """
 
     prismatic: bool

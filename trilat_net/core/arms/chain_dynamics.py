@@ -195,7 +195,7 @@ class ChainDynamics:
         return torque
 
     def compute_gradient(self, q: Array, qd: Array, v: Array, a: Array) -> Array:
-        """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
+        """Returns Y'r, the gradient with which the adaptive law updates parameter estimates.
 
         Y is the regressor: Y theta is the torque required for a motion, where theta is the
         parameter vector. Y' is the transpose of Y, and r = qd - v the velocity error.

@@ -34,9 +34,9 @@ microradian.
 def sincos(x: float) -> tuple[float, float]:
     """Computes the sine and cosine of an angle in rad, bit-identical on every machine.
 
-    The absolute error is at most 2^-52. Beyond 1e5 rad, rounding of the angle itself causes an
-    error of similar size. Both results are NaN if the angle is not finite or its magnitude
-    exceeds `LARGEST_RAD`.
+    The absolute error is at most 2^-52 for angles up to 1e5 rad in magnitude. For larger
+    angles, it can be about as large as the rounding error of the angle itself. Both results are
+    NaN if the angle is not finite or its magnitude exceeds `LARGEST_RAD`.
     """
     # The nearest quarter turn, and the angle y from there. `round_down` returns a float, so
     # that computing y need not wait for conversions to an integer and back.

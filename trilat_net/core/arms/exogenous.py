@@ -134,9 +134,9 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
     - `table_first` and `table_count` select the rows of the common table that belong to this
       operator or environment: recorded torques, sines, or parameters of a user's function.
     - `call` is the address of a function written by a user. The function reads its input from
-      `t_s` (time since the start of the session, s), `coordinates` (their number), `at`
-      (position of the arm, rad or m) and `speed` (derivative of `at`), and writes the force or
-      torque into `effort`, N or N m.
+      `t_s` (time since the start of the session, s), `coordinates` (number of coordinates),
+      `at` (position of the arm, rad or m) and `speed` (derivative of `at`), and writes the
+      force or torque into `effort`, N or N m.
 
     Args:
         width: Largest length of the vectors of all operators and environments.

@@ -46,7 +46,7 @@ class FramePose(NamedTuple):
 
     @classmethod
     def from_rotation_vector(cls, vector_rad: Three) -> "FramePose":
-        """Returns the pose with the rotation of a rotation vector, and no translation.
+        """Returns the pose with the rotation given by a rotation vector, and no translation.
 
         Args:
             vector_rad: Axis of the rotation times its angle, rad.

@@ -57,7 +57,7 @@ def rotation_matrix(vector: Three) -> Matrix:
     """Returns the rotation matrix of a rotation vector, as three rows.
 
     The direction of a rotation vector is the rotation axis, and its length is the angle in rad.
-    Rodrigues' formula is used, with series limits for small angles.
+    Rodrigues' formula is used. For small angles, its coefficients are replaced by their limits.
     """
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)

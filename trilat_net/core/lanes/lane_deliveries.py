@@ -508,7 +508,7 @@ def use_samples(
         first: First tick of the block.
         count: Number of ticks.
         rate_hz: Tick rate of all sites, Hz.
-        ended: For each lane, the number of ticks of a run that has ended, or -1 if it has not.
+        ended: For each lane, the number of ticks executed if the run has ended, otherwise -1.
         states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
         used: Output array for the index of the sample in use, or -1 before the first sample,

@@ -232,8 +232,9 @@ class LaneEpisodes(LaneRun):
         ticks: Number of ticks that each run has executed, shape (LANES,).
         hands: The program's hand in each lane.
         structure: The common structure of the runs, see `RunStructure`.
-        most_runs: Largest number of lanes that hold a run.
-        least_runs: Number of runs from which lanes are faster than running them one by one.
+        most_runs: Largest number of runs that can be simulated together.
+        least_runs: Smallest number of runs for which lanes are faster than simulating the runs
+            one by one.
     """
 
     clock = _CLOCK
@@ -296,8 +297,8 @@ class LaneEpisodes(LaneRun):
     def explain_run(cls, run: CompiledRun, hand_site: int) -> str:
         """Explains why a run cannot be simulated side by side with others.
 
-        Returns an empty string if it can. This compiles the simulation code to find out, which
-        can take seconds.
+        Returns an empty string if it can. To find out, the method compiles the simulation code,
+        which can take seconds.
 
         Args:
             run: The run before its first tick.

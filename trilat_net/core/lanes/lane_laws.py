@@ -48,8 +48,8 @@ class LaneLaw(NamedTuple):
         name: Identifies the code of the law. `NO_LAW` for laws of the kernel.
         is_stored: True if the compiled code may be stored on disk.
         size: Number of gains and memory values of the law.
-        constants: Names and values of the flags among these values, which are integers equal to
-            0 or 1 that never change. They are equal in all runs.
+        constants: Names and values of the flags among the gains and memory values. Flags are
+            integers equal to 0 or 1 that never change and are equal in all runs.
         columns: For each peer, the indices of the values that the law receives among the values
             that the peer sends, or -1 for a value that the peer does not send.
     """

@@ -158,17 +158,17 @@ class RowType(types.Type):
 class RowsInLane(_PartOfTable):
     """Numba type of an array of records of one simulation, for example of all links of a site.
 
-    Several runs are simulated side by side, with one run per lane. The same value of all runs
-    is adjacent in memory, and this type selects those of a single run.
+    Several runs are simulated side by side, with one run per lane. Corresponding values of all
+    runs are adjacent in memory, and this type selects those of a single run.
     """
 
 
 class LaneRow(RowType, _PartOfTable):
     """Numba type of one record of one simulation, whose fields compiled code reads by name.
 
-    Several runs are simulated side by side, with the same value of all runs adjacent in memory.
-    This type hides that memory layout, so the same source code also works for a run that is
-    simulated alone.
+    Several runs are simulated side by side, with corresponding values of all runs adjacent in
+    memory. This type hides that memory layout, so the same source code also works for a run
+    that is simulated alone.
     """
 
 

@@ -287,9 +287,9 @@ class _LinksOfRun:
 
         Args:
             ticks: Number of ticks that each site has executed.
-            links: Rows of its links after these ticks. Only the fields of the sample in use,
-                and those written in stage 3 of a tick, are up to date.
-            states: The latest states of its sites, see `repeat_deliveries`.
+            links: Rows of the run's links after these ticks. Only the fields of the sample in
+                use, and those written in stage 3 of a tick, are up to date.
+            states: The latest states of the run's sites, see `repeat_deliveries`.
             received: Values from laws that arrived with the samples in use, shape (N P, C).
         """
         self._ends.append(ticks.copy())
@@ -354,7 +354,7 @@ class LaneRun:
 
     Attributes:
         runs: The runs in the lanes. `advance_to` writes the results to them.
-        clock: Type of the ticks, see `_list_argument_types`.
+        clock: Numba type of a tick and of its nominal time, see `_list_argument_types`.
     """
 
     clock: types.Type = types.int64
@@ -386,7 +386,8 @@ class LaneRun:
     def explain_uncompilable(cls, run: CompiledRun) -> str:
         """Explains to the user why a control law cannot be compiled for several runs at once.
 
-        Such a law may still be compilable for a single run. This compiles the code to find out.
+        The method tries to compile the code. A law for which this fails may still be compilable
+        for a single run.
 
         Args:
             run: The run before its first tick, see `list_code`.
@@ -541,7 +542,7 @@ class LaneRun:
         return np.array(addresses, dtype=np.int64)
 
     def advance_to(self, until_s: float) -> None:
-        """Continues all runs to the end of a run with a duration of `until_s` seconds.
+        """Continues all runs until each has lasted `until_s` seconds.
 
         A run ends earlier if an arm leaves its limits. The results are written to the
         `CompiledRun` objects, together with the latest records if these are kept.

@@ -527,13 +527,13 @@ class EndedRuns(NamedTuple):
         site_ticks: Number of ticks executed by each site, shape (N, LANES).
         site_rows: Rows of the sites, shape (N, words per row, LANES).
         links: Rows of the links, shape (N P, words per row, LANES). Only `LaneEpisodes` keeps
-            them, because copying them in `keep_ended_runs` makes all ticks slower by half.
+            them, because copying them in `keep_ended_runs` slows down every tick considerably.
         records: Records, shape (N, floats, LANES).
         sums: Rows of the sums, shape (N, words per row, LANES).
         progress: Rows of the progress, shape (N, words per row, LANES).
         laws: Gains and memory of compiled laws, shape (N, values, LANES).
         sent: Values sent by these laws, shape (N, values, LANES).
-        peaks: Peaks in the bucket of this time, shape (N, 3 n, LANES).
+        peaks: Peaks in the bucket of the last tick, shape (N, 3 n, LANES).
     """
 
     ticks: IntArray
@@ -693,7 +693,7 @@ def call_site(
         record_row: Row of the tick in the table of records.
         tables: Addresses of the tables of the site, shape (15,).
         states: The latest states of all sites.
-        used: Samples in use of the site.
+        used: Samples that the site uses.
         columns: Indices of the values received by the site's law.
         table: Tables of the operators and environments.
     """

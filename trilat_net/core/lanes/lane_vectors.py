@@ -85,7 +85,7 @@ class LaneVector(types.Type):
         """Returns the type of a variable that is a vector in one branch, a scalar in another.
 
         Numba requires a single type per variable. This is the vector type, in which the scalar
-        is repeated for all eight runs. Returns None, which is a compilation error, if the
+        is repeated for all eight runs. Returns None, which causes a compilation error, if the
         vector does not contain floats or if the other value is not a number.
         """
         is_number = isinstance(other, types.Float | types.Integer)

@@ -19,11 +19,11 @@ from .lane_run import LaneRun
 from .lane_structure import RunStructure
 
 LEAST_RUNS = 4
-"""Number of runs from which lanes are faster than running them one by one."""
+"""Smallest number of runs for which lanes are faster than simulating the runs one by one."""
 
 
 LANE_SITE_TICKS = 100_000_000
-"""Number of site ticks from which a study compiles the code for several runs side by side.
+"""Least number of site ticks for which a study compiles the code for side-by-side runs.
 
 Compilation takes about ten seconds per type of site. The code then saves about 0.4 us per site
 tick.
@@ -148,8 +148,8 @@ class RunGroup:
         Args:
             make_run: Function that returns one of the runs before its first tick.
             runs: Number of runs with this structure.
-            least_site_ticks: Number of simulated ticks, summed over all sites and runs, from
-                which compiling the code pays off. Infinity to use existing code only.
+            least_site_ticks: Smallest number of simulated ticks, summed over all sites and
+                runs, for which compiling the code pays off. Infinity to use existing code only.
         """
         probes = [make_run() for _ in range(LEAST_RUNS)]
         site_ticks = runs * probes[0].duration_s * sum(probes[0].rates_hz)

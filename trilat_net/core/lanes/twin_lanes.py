@@ -35,7 +35,7 @@ class TwinLanes(LaneRun):
     The run itself is in lane 0.
 
     Args:
-        run: The run before its first tick, see `suits`. This object does not advance.
+        run: The run before its first tick, see `suits`. The object itself is not advanced.
         count: Number of runs, including the twins.
         ticks: Number of ticks of each site in the whole run.
         feed: Inputs of the recorded run to repeat.
@@ -63,8 +63,8 @@ class TwinLanes(LaneRun):
             run: The run before its first tick.
             runs: Number of runs, including the twins.
             ticks: Number of ticks of each site.
-            least_site_ticks: Number of simulated ticks, summed over all sites and runs, from
-                which compiling the code pays off.
+            least_site_ticks: Smallest number of simulated ticks, summed over all sites and
+                runs, for which compiling the code pays off.
         """
         if not LEAST_RUNS <= runs <= LANES or RunStructure.find_obstacle(run):
             return False

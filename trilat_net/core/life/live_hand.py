@@ -216,8 +216,8 @@ class HandCommand(NamedTuple):
 class HandMemory(NamedTuple):
     """State of a person's or program's hold on an arm, kept between two control periods.
 
-    Contains who holds the arm, how firmly, and the motion of the target towards which the arm
-    is pulled.
+    The state covers who holds the arm, how firmly, and the motion of the target towards which
+    the arm is pulled.
 
     Attributes:
         source: Sender that holds the arm. 0 if nobody holds it, although an earlier grip may
@@ -329,9 +329,9 @@ class HandStep(NamedTuple):
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
     """Returns the state one tick later, with the target moved and the grip updated.
 
-    The target moves at its velocity `rate`. The grip, a factor of the force from 0 to 1, grows
-    while a sender holds the arm and fades afterwards, taking GRIP_NS for the full range. Once
-    the grip has faded to 0, there is no holder and no target.
+    The target moves at its velocity `rate`. The spring force is multiplied by the grip, a
+    factor from 0 to 1. The grip grows while a sender holds the arm and fades afterwards, taking
+    GRIP_NS for the full range. Once the grip has faded to 0, there is no holder and no target.
 
     Args:
         rules: Limits of the hand, and the rate of the control loop.
@@ -420,9 +420,9 @@ def glide(
     """Computes how a person or program pulls an arm in several ticks without a new message.
 
     A simulated spring pulls the arm towards a target, which moves to the goal of the last
-    message. The grip, a factor of the force from 0 to 1, grows initially. The results are
-    bit-identical to those of `HandRules.advance`, but a single compiled call computes all
-    ticks.
+    message. The spring force is multiplied by the grip, a factor from 0 to 1 that grows
+    initially. The results are bit-identical to those of `HandRules.advance`, but a single
+    compiled call computes all ticks.
 
     Args:
         first: The first tick.
