@@ -66,8 +66,8 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
 def find_package(group: str, name: str) -> str:
     """Returns the optional package, such as trilat-studies, that defines a name.
 
-    Error messages use it to tell the user which package to install. Returns "" if no optional
-    package defines the name.
+    Error messages tell the user to install this package. Returns "" if no optional package
+    defines the name.
 
     Args:
         group: `COMMANDS`, `FUNCTIONS`, `VIEWS` or `HOOKS`.

@@ -45,7 +45,7 @@ def register_hooks(package: str, functions: Mapping[str, str]) -> None:
 def find_hook(hook: str) -> Any:
     """Returns the function that a higher-level package registered under a name.
 
-    This lets a lower-level package call it without importing that package.
+    A lower-level package can thus call the function without importing the higher-level one.
 
     Args:
         hook: Name of the hook, for example "plot a log".

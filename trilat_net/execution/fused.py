@@ -50,7 +50,7 @@ def _find_largest_ratio(scenario: Scenario) -> int:
 class FusedRun(CompiledRun):
     """Simulates all arms of a scenario in one compiled loop.
 
-    `CompiledRun` describes which programs are called in addition to the loop.
+    See `CompiledRun` for the programs that are called in addition to the loop.
 
     Args:
         scenario: The scenario.
@@ -59,8 +59,8 @@ class FusedRun(CompiledRun):
         keep: Number of most recent records per site that are kept for `pop_records`.
         inputs: Inputs of a recorded run that is repeated. The scenario's programs then do not
             act as operators, because their actions are part of the inputs.
-        hands: Mapping from site to live operator. They replace the programs named in the
-            scenario.
+        hands: Mapping from site to live operator. These operators replace the programs named in
+            the scenario.
         runs_plants: If True, users' programs move the external arms for which the scenario
             names such a program. Otherwise, a scenario with an external arm is rejected.
 
@@ -69,7 +69,7 @@ class FusedRun(CompiledRun):
         plants: Mapping from site name to the program that moves its arm.
 
     Raises:
-        CodeWithheld: The class of a program may not run.
+        CodeWithheld: The class of a program is not allowed to run.
         ScenarioError: The loop cannot execute the scenario, see `check_scenario`, or a law
             cannot be created.
     """
@@ -120,8 +120,9 @@ class FusedRun(CompiledRun):
                 motion of the arm.
 
         Raises:
-            ScenarioError: Another arm is external, or the tick rates differ so much that too
-                many samples would arrive in one tick of the slowest site.
+            ScenarioError: An arm of a site that is not in `plants` is external, or the tick
+                rates differ so much that too many samples would arrive in one tick of the
+                slowest site.
         """
         scenario.refuse_external_arms(plants)
         ratio = _find_largest_ratio(scenario)
@@ -187,7 +188,7 @@ class FusedRun(CompiledRun):
 
         Args:
             log: Log of the run.
-            own_laws: True if control laws written by users may run.
+            own_laws: True if control laws written by users are allowed to run.
 
         Returns:
             The reason, for the user, or an empty string if the run can be repeated.

@@ -47,7 +47,7 @@ class LogCheckReport(CheckReport):
     Attributes:
         findings: One finding per check, in display order.
         log: The checked log.
-        result: Result of re-executing the sites of the log.
+        result: Result of re-executing the ticks of the log.
     """
 
     log: Log
@@ -60,7 +60,7 @@ class LogCheckReport(CheckReport):
 
     @property
     def identical(self) -> int:
-        """Number of records whose re-execution was bit-identical in every computed field."""
+        """Number of records that were reproduced bit for bit in every computed field."""
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class LogCheckReport(CheckReport):
 
         Raises:
             LogError: A record cannot be read.
-            ScenarioError: A user's control law that may run cannot be created.
+            ScenarioError: A user's control law that is allowed to run cannot be created.
         """
         result = verify_log(log, progress, min_coverage=min_coverage, resume_every=resume_every)
         findings = list(_check_log(log, result, virtual=virtual, progress=progress))
@@ -132,7 +132,7 @@ class LogCheckReport(CheckReport):
     def check_files(
         cls, sources: Sequence[str], min_coverage: float, allowed: CodeConsents
     ) -> CheckReport:
-        """Checks one log in a form that can run in a worker process of a pool.
+        """Checks one log, possibly in a worker process of a pool.
 
         The arguments and the result can be sent to another process, so many logs can be checked
         in parallel. A user's control law that cannot be created yields a failed finding instead
@@ -171,7 +171,7 @@ def _check_log(
 
     Args:
         log: The log.
-        result: Result of re-executing the log.
+        result: Result of re-executing the ticks of the log.
         virtual: If True, the log is also compared with virtual time.
         progress: Function that reports the progress of this comparison.
     """
@@ -237,7 +237,7 @@ def _check_virtual_time(
 
     Args:
         log: The log.
-        result: Result of re-executing the log.
+        result: Result of re-executing the ticks of the log.
         progress: Function that reports the progress of the comparison. If None, progress is not
             reported.
     """
@@ -276,7 +276,7 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
 
     Args:
         log: The log.
-        result: Result of re-executing the log.
+        result: Result of re-executing the ticks of the log.
     """
     coverage = result.coverage
     if coverage.expected:
@@ -304,17 +304,17 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
 
 
 def _check_execution(result: VerifyResult, recorded: str) -> Finding:
-    """Returns the finding on whether re-executing the log gave the same records.
+    """Returns the finding on whether re-executing the ticks of a log gave the same records.
 
     The text of the finding begins with the number of identical records. Everything that limits
     the comparison is appended: missing records, ticks that a site did not execute because it
-    had left the session, sites that were not re-executed, records that could not be judged, and
+    had left the session, sites that were not run again, records that could not be judged, and
     differences.
 
     Args:
-        result: Result of re-executing the log.
+        result: Result of re-executing the ticks of the log.
         recorded: Subject and verb of a sentence about sites whose records were copied, such as
-            "m1 stands". Empty if all sites were executed.
+            "m1 stands". Empty if no records were copied.
     """
     withheld = ""
     if result.withheld:
@@ -364,7 +364,8 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
     Args:
         finding: Finding of a check.
         log: Log of the run.
-        result: Result of re-executing the log, without restoring sites from records.
+        result: Result of re-executing the ticks of the log, without restoring sites from
+            records.
 
     Returns:
         The finding, with the advice if it states that whole runs of users' laws agree.

@@ -20,7 +20,7 @@ from ..log import IndexedRecords, Log, SiteLog
 from ..records import NS_PER_S
 
 BLOCK_ROWS = 1 << 14
-"""Maximum number of records that are re-executed together."""
+"""Maximum number of records whose ticks are re-executed together."""
 LEAST_ROWS = 8
 """Minimum number of records for which the compiled loop is faster than single ticks."""
 _FIRST_TARGET = 3
@@ -47,7 +47,7 @@ class SampleTable(NamedTuple):
     def of_log(cls, log: Log) -> "SampleTable | None":
         """Collects the samples that all sites of a log sent, for use by the compiled loop.
 
-        When the loop re-executes a site, it looks up the content of each sample that arrived.
+        When the loop re-executes a tick, it looks up the content of each sample that arrived.
 
         Args:
             log: The log.
@@ -114,7 +114,7 @@ def _find_samples(
 
 
 class PlainRows:
-    """Reads the records of one site in blocks that compiled code can re-execute.
+    """Reads the records of one site in blocks whose ticks compiled code can re-execute.
 
     Only plain records are read, meaning that all inputs of the tick are in the log.
 
@@ -149,7 +149,7 @@ class PlainRows:
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
-        """Counts the records that compiled code can execute next in a single block.
+        """Counts the records whose ticks compiled code can execute next in a single block.
 
         The caller ensures that the first record comes from the current start of the site's
         process and belongs to the next tick. A block has at most `BLOCK_ROWS` records.

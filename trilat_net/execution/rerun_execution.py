@@ -1,14 +1,14 @@
-"""Re-executes arms of a log with changed settings, and rejects changes that have no effect.
+"""Runs arms of a log again with changed settings, and rejects changes that have no effect.
 
-A log has one record per tick for each arm. `what_if` uses this module to compute some or all
-arms again, for example with a different gain at the slave. A setting that affects only arms
-that are not executed is rejected, because it would have no effect. A setting that affects both
-kinds of arms changes only the executed ones, and the result reports this.
+A log has one record per tick for each arm. `what_if` uses this module to run some or all arms
+again, for example with a different gain at the slave. A setting that affects only arms that are
+not run again is rejected, because it would have no effect. A setting that affects both kinds of
+arms changes only those that are run again, and the result reports this.
 
 Invariant:
     - A site advances only through `Site.step`.
-    - A site receives the recorded samples of sites that are not executed, and the new samples
-      of executed sites. Each sample arrives in the tick in which it arrived according to the
+    - A site receives the new samples of the sites that are run again, and the recorded samples
+      of all other sites. Each sample arrives in the tick in which it arrived according to the
       log.
     - Without changed settings, a tick is not executed if its inputs are unknown because records
       are missing. After a gap, execution resumes as soon as two consecutive records exist. If a
@@ -64,15 +64,15 @@ class _ChangedValue(NamedTuple):
 
 @dataclass(frozen=True)
 class RerunRequest:
-    """A checked request for a rerun: which sites of a log to execute again, and how.
+    """A checked request for a rerun: which sites of a log to run again, and how.
 
-    Created by `RerunRequest.resolve`. Sites that are not executed keep the records of the log.
+    Created by `RerunRequest.resolve`. All other sites keep the records of the log.
 
     Attributes:
         original: Scenario of the log.
-        scenario: Scenario of the rerun. It contains the changes for the executed sites; the
+        scenario: Scenario of the rerun. It contains the changes for the sites to run again; the
             recorded sites are the same as in the log.
-        replaced: Names of the executed sites, in scenario order.
+        replaced: Names of the sites to run again, in scenario order.
         recorded: Names of the other sites, in scenario order.
         changes: Changed values.
         without_effect: Requested changes that affect only recorded sites, and therefore have no
@@ -88,9 +88,9 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """Kind of the rerun: "closed loop" if every site is executed, otherwise "open loop".
+        """Kind of the rerun: "closed loop" if every site is run again, otherwise "open loop".
 
-        In an open loop, the sites that are not executed keep their records, and therefore do
+        In an open loop, the sites that are not run again keep their records, and therefore do
         not react to changes.
         """
         return "open loop" if self.recorded else "closed loop"
@@ -123,14 +123,14 @@ class RerunRequest:
     ) -> "RerunRequest":
         """Checks a request for a rerun, and applies its changes to the scenario of the log.
 
-        A rerun executes sites of a log again, usually with changed settings. In a closed loop,
-        all sites are executed. Otherwise, the sites that are not executed keep their records.
+        A rerun runs sites of a log again, usually with changed settings. In a closed loop, all
+        sites are run again. Otherwise, some sites keep their records.
 
         Args:
             log: Log of a run, which contains its scenario.
-            replace: Names of the sites to execute. Empty for a closed loop.
+            replace: Names of the sites to run again. Empty for a closed loop.
             overrides: Changed settings, in the form accepted by `load_scenario`.
-            closed_loop: If True, all sites are executed.
+            closed_loop: If True, all sites are run again.
 
         Raises:
             UsageError: Both `replace` and `closed_loop` are given, or neither is.
@@ -175,13 +175,13 @@ class RerunRequest:
 
 
 def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
-    """Raises ScenarioError if the arm of a site to be re-executed is external.
+    """Raises ScenarioError if the arm of a site to be run again is external.
 
     The log does not show how a real robot or a user's program would have reacted to different
     torques.
 
     Raises:
-        ScenarioError: A site that is to be re-executed has such an arm.
+        ScenarioError: A site that is to be run again has an external arm.
     """
     for name in original.external:
         if name not in replaced:
@@ -202,7 +202,7 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
 
     Args:
         key: Dotted path of the setting, such as "sites.m1.control.Kd".
-        replaced: Names of the executed sites.
+        replaced: Names of the sites to run again.
         recorded: Names of the other sites.
     """
     section, _, path_in_section = key.partition(".")
@@ -237,12 +237,12 @@ def _check_recorded_limits(
     """Rejects changes to a rerun that are not covered by the recorded arrivals of samples.
 
     These are different sites, a longer duration, and different tick rates if some sites are not
-    executed.
+    run again.
 
     Args:
         original: Scenario of the log.
         requested: Scenario with the changes.
-        recorded: Names of the sites that are not executed.
+        recorded: Names of the sites that are not run again.
     """
     if requested.names != original.names:
         raise ScenarioError(
@@ -271,14 +271,14 @@ def _join_scenarios(
 ) -> Scenario:
     """Returns the requested scenario, but with the original settings of the recorded sites.
 
-    The executed sites use the requested settings. The recorded sites keep their own settings,
-    which include the links over which they receive, and the planned changes of these links and
-    of their dominance factors.
+    The sites to run again use the requested settings. The recorded sites keep their own
+    settings, which include the links over which they receive, and the planned changes of these
+    links and of their dominance factors.
 
     Args:
         original: Scenario of the log.
         requested: Scenario with the changes.
-        recorded: Names of the sites that are not executed, and keep their records.
+        recorded: Names of the sites that are not run again, and keep their records.
     """
 
     def choose(site: str) -> Scenario:
@@ -396,8 +396,8 @@ class RerunTick(NamedTuple):
             log.
         same: True if the log contains a record of the tick, and all computed fields are
             bit-identical.
-        kept: True if the record was copied, because the log does not contain enough to execute
-            the tick.
+        kept: True if the record was copied, because the log does not contain enough data to
+            execute the tick.
         stats: Statistics of the site's links. None if they are not due in this tick.
     """
 
@@ -412,7 +412,7 @@ class RerunTick(NamedTuple):
 
 
 class _RerunSite:
-    """Re-executes one site of a log, tick by tick.
+    """Runs one site of a log again, tick by tick.
 
     The state of the site is certain if it follows from the previous ticks. It becomes uncertain
     after a gap in the log. Records are then copied until two consecutive records determine the
@@ -420,11 +420,11 @@ class _RerunSite:
 
     Args:
         log: The log.
-        request: Executed sites and changed settings of the rerun.
+        request: Sites to run again, and changed settings.
         name: Name of the site.
         deliveries: The ticks in which samples from other sites arrive at this one.
-        samples: Samples of all sites, keyed by site and tick. The samples of executed sites are
-            added as they are computed.
+        samples: Samples of all sites, keyed by site and tick. The samples of sites that are
+            run again are added as they are computed.
 
     Attributes:
         name: Name of the site.
@@ -635,26 +635,26 @@ No sample is in transit for longer.
 
 
 class RerunExecution:
-    """Executes all requested sites of a log again, together.
+    """Runs all requested sites of a log again, together.
 
-    The executed sites exchange newly computed samples. The samples of the other sites are taken
-    from the log.
+    These sites exchange newly computed samples. The samples of the other sites are taken from
+    the log.
 
     Args:
         log: The log.
-        request: Executed sites and changed settings of the rerun.
+        request: Sites to run again, and changed settings.
 
     Attributes:
-        sites: Mapping from name to executed site.
+        sites: Mapping from the name of each site that is run again to the site.
 
     Raises:
-        LogError: The log does not contain enough to execute the sites.
+        LogError: The log does not contain enough data to run the sites again.
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
-        """Creates the sites that are re-executed, and connects them to each other.
+        """Creates the sites that are run again, and connects them to each other.
 
-        They receive what the other sites compute now, not what was recorded.
+        They exchange newly computed samples instead of those in the log.
         """
         self._log = log
         self._request = request
@@ -752,7 +752,7 @@ class RerunExecution:
                 progress(executed, total)
 
     def _keep_sample(self, site: _RerunSite) -> None:
-        """Stores the newest sample of an executed site, which its peers will receive.
+        """Stores the newest computed sample of a site, which its peers will receive.
 
         Samples that are too old to arrive are removed.
         """
@@ -771,8 +771,8 @@ class RerunExecution:
         missing samples are then treated as not contained in the log.
 
         Args:
-            pending: Next tick of each executed site that has not finished, as (time in ns,
-                index of the site among the executed sites, tick), in order of time.
+            pending: Next tick of each site that has not finished, as (time in ns, index of the
+                site among those that are run again, tick), in order of time.
 
         Returns:
             Index of the chosen entry in `pending`.
@@ -787,8 +787,8 @@ class RerunExecution:
         """Returns True if all samples that arrive in a site's next tick are known.
 
         A sample is ready if the sender has executed the tick that produces it, or has finished
-        and never will. The samples of a sender that is not executed are in the log, so they are
-        always ready.
+        and never will. The samples of a recorded sender are in the log, so they are always
+        ready.
 
         Args:
             receiver: Name of the site.

@@ -80,7 +80,7 @@ def select_peer_channels(
 
     Args:
         arrivals: Arrivals with the values for all receivers.
-        links: Links of the receiver, one per peer and in the same order.
+        links: Links of the receiver, in the order of its peers.
     """
     selected = []
     for arrival in arrivals:
@@ -96,13 +96,13 @@ def select_peer_channels(
 def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
     """Returns how an operator moved a site's arm in one tick, according to the log.
 
-    The re-executed site may have a different tick rate, so the newest record up to the time of
-    the tick is used.
+    The site that is run again may have a different tick rate, so the newest record up to the
+    time of the tick is used.
 
     Args:
         site_log: Records of the site in the log.
-        site: The re-executed site.
-        k: Number of the tick of the re-executed site.
+        site: The site that is run again.
+        k: Number of the tick of this site.
 
     Returns:
         The operator's grip, target and velocity, in the order of `HandInForce`. Empty if the
@@ -121,7 +121,7 @@ def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
 class RecordedInputs(Generic[Change]):
     """All inputs of one site according to a log: received samples and changes of settings.
 
-    With these inputs, the site can be executed again.
+    With these inputs, the site can be run again.
 
     Args:
         site_log: Records of the site.
@@ -129,7 +129,8 @@ class RecordedInputs(Generic[Change]):
         ends: Last tick of each site.
         changes: Changes that took effect at the site, keyed by tick.
         links: Links over which the site receives, in the order of its peers.
-        states: Records of the site, if they differ from the decoded records of `site_log`.
+        states: Records of the site, possibly decoded only on access. None to use those of
+            `site_log`.
 
     Attributes:
         samples: Samples of each peer, keyed by the tick in which the peer published them.
@@ -265,7 +266,7 @@ class RecordedInputs(Generic[Change]):
         `can_resume` first to check that these records and all other required data exist.
 
         Args:
-            site: The re-executed site, whose state is replaced.
+            site: The site that is run again; its state is replaced.
             row: Index of the record of the next tick, among the records of the site.
             changes: Changes of settings since the last executed tick of the site.
         """

@@ -1,4 +1,4 @@
-"""Verifies a log by re-executing every site and comparing every computed field of every record.
+"""Verifies a log by re-executing every tick and comparing every computed field of every record.
 
 This is possible because the log contains not only the result of each tick, but also its inputs,
 such as the samples that arrived.
@@ -99,10 +99,10 @@ class RecordDifference(NamedTuple):
 
     @classmethod
     def of_law_failure(cls, failure: LawFailed) -> "RecordDifference":
-        """Describes a user's control law that fails when a log is re-executed.
+        """Describes the failure of a user's control law in a re-executed tick of a log.
 
-        The law did not fail in the logged session. The site that uses the law cannot be
-        executed any further, and the report counts the failure as a logged record that the
+        The law did not fail in the logged session. No further ticks of the site that uses the
+        law can be executed, and the report counts the failure as a logged record that the
         re-execution did not reproduce.
 
         Args:
@@ -250,7 +250,7 @@ def _compare_fields(
 
 @dataclass(slots=True)
 class VerifyResult:
-    """Result of checking a log by re-executing its sites.
+    """Result of checking a log by re-executing its ticks.
 
     Each record is judged by comparing it with the result of re-executing its tick. It may be
     impossible to judge a record after a gap in the log.
@@ -269,8 +269,8 @@ class VerifyResult:
         gaps: Ranges of missing ticks, as (site, first tick, last tick).
         absences: Ranges of ticks that a site did not execute because it had left the session,
             as (site, first tick, last tick).
-        withheld: Names of the sites that were not executed, because their control law is code
-            that may not run. They are excluded from all other results.
+        withheld: Names of the sites that were not run again, because their control law is code
+            that is not allowed to run. They are excluded from all other results.
     """
 
     whole_run: bool
@@ -310,8 +310,8 @@ class VerifyResult:
         The log of a rerun contains some sites that were copied from an older log. These sites
         are checked against that log, which gives a separate result.
 
-        Counts are added, and lists are concatenated. The merged result covers whole runs, or is
-        intact, only if this holds for both results.
+        Counts are added, and lists are concatenated. In the merged result, `whole_run` is True
+        only if it is True in both results, and `integrity` passes only if it passes in both.
 
         Args:
             other: Result for the other sites. It is not modified.
@@ -355,11 +355,11 @@ _MOST_SINGLE_RECORDS = 1 << 12
 
 
 class _SiteVerifier:
-    """Re-executes one site from its records, and compares each record with the result.
+    """Re-executes the recorded ticks of one site, and compares each record with the result.
 
-    The state of the executed site is certain as long as it follows from the previous records.
-    It becomes uncertain at a gap in the log, and if the site uses a sample that the log does
-    not contain. Two consecutive records make it certain again.
+    The state of the site is certain as long as it follows from the previous records. It becomes
+    uncertain at a gap in the log, and if the site uses a sample that the log does not contain.
+    Two consecutive records make it certain again.
 
     The log does not show which samples arrived during a gap. A sample that no record lists is
     assumed to have arrived during the gap. While such a sample is in use, a deviating record is
@@ -435,9 +435,9 @@ class _SiteVerifier:
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Re-executes every recorded tick of a site, and compares the results with the log.
 
-        Long sequences of ordinary records are executed by a compiled loop, and all others one
-        by one. The counts of identical, differing and missing records are added to the
-        `VerifyResult` of this object.
+        The ticks of long sequences of plain records are executed by a compiled loop, and all
+        other ticks one by one. The counts of identical, differing and missing records are added
+        to the `VerifyResult` of this object.
 
         Args:
             report: Function that is called from time to time with the number of examined
@@ -655,7 +655,7 @@ class _SiteVerifier:
         return self._states[row].boot
 
     def _set_site(self, site: Site) -> None:
-        """Replaces the executed site with another site."""
+        """Replaces the simulated site with another one."""
         self._site = site
         self._repeater = None
 
@@ -694,7 +694,7 @@ class _SiteVerifier:
         )
 
     def _find_other_sender(self, state: State) -> RecordDifference | None:
-        """Reports a record that was not written by the process that is being re-executed.
+        """Reports a record that was not written by the process whose ticks are re-executed.
 
         Returns:
             The difference if the record names another start of the process (boot) or another
@@ -769,7 +769,7 @@ class _SiteVerifier:
             result.add_difference(difference)
 
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
-        """Returns the changes up to a tick that have not been executed yet.
+        """Returns the changes up to a tick that have not been applied yet.
 
         A change is a new link model, a new set of dominance factors, or a command to the site,
         such as a stop. The log contains it as text. An invalid text proves that the log is not
@@ -834,17 +834,17 @@ def verify_log(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> VerifyResult:
-    """Re-executes every site of a log, and compares each record with the result.
+    """Re-executes every recorded tick of a log, and compares each record with the result.
 
     If all records agree, the log contains exactly what its scenario and its recorded inputs
-    produce. The log of a rerun contains some sites that were executed with changed settings,
+    produce. The log of a rerun contains some sites that were run again with changed settings,
     and others whose records were copied from a source log. The copied records are compared with
-    the source log, and these sites are re-executed from the source log, which must be in the
-    same folder.
+    the source log, and their ticks are re-executed with the inputs in the source log, which
+    must be in the same folder.
 
     Args:
         log: Log of a run or rerun.
-        progress: Function that is called from time to time with the number of executed records
+        progress: Function that is called from time to time with the number of examined records
             and their total.
         min_coverage: Smallest fraction of the ticks of every site that must be judged.
         resume_every: In every tick that is divisible by this number, the site is replaced by a
@@ -853,7 +853,7 @@ def verify_log(
 
     Raises:
         LogError: A record cannot be read.
-        ScenarioError: A user's control law that may run cannot be created.
+        ScenarioError: A user's control law that is allowed to run cannot be created.
     """
     result = _make_result(log, min_coverage)
     with process.pause_gc():
@@ -893,9 +893,9 @@ def _execute_sites(
     report: Callable[[int], None] | None = None,
     resume_every: int = 0,
 ) -> None:
-    """Executes the given sites of a log, and adds the counts and differences to a result.
+    """Re-executes the ticks of given sites, and adds the counts and differences to a result.
 
-    Sites whose control law may not run are left out.
+    Sites whose control law is not allowed to run are left out.
 
     Args:
         log: The log.
@@ -926,7 +926,7 @@ def _execute_sites(
 def _map_records(log: Log, *, lazy: bool) -> dict[str, Mapping[int, State]]:
     """Returns the records of all sites of a log, keyed by site and tick.
 
-    When a site is re-executed, it looks up the samples that it received in these records.
+    When a tick is re-executed, the samples that arrived in it are looked up in these records.
 
     Args:
         log: The log.

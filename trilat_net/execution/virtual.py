@@ -167,7 +167,7 @@ class SiteChannels:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the event that marks the end of a site in the log.
+        """Returns the event that marks the end of a site's run in the log.
 
         Args:
             t_ns: Time of the event, in ns after the epoch (the common start time). By default,
@@ -366,7 +366,7 @@ def execute_virtual(
     hands: HandTracks = {},  # noqa: B006
     plants: Mapping[str, PlantPlayer] = {},
 ) -> Iterator[SiteTick]:
-    """Executes all sites of a scenario in virtual time, and yields every tick of every site.
+    """Simulates all sites of a scenario in virtual time, and yields every tick of every site.
 
     In virtual time, the sites run in one process, as fast as possible. Ticks are executed in
     order of their nominal time; simultaneous ticks are executed in scenario order of their

@@ -301,7 +301,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
             """Simulates the scenario of the recorded session again, tick by tick.
 
             The commands, the actions of live operators and the motion of external arms are
-            taken from the log. A tick is executed when its record is read.
+            taken from the log. A tick is executed when the caller requests its record.
 
             Args:
                 network: Network that delivers the samples. If None, samples arrive at once.

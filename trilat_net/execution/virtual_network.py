@@ -81,7 +81,7 @@ class PromptNetwork:
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Stores the sample that a site sends in a tick until all others have received it."""
+        """Stores the sample of a tick until all other sites have received it."""
         for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
@@ -281,10 +281,10 @@ class Deliveries(NamedTuple):
     ) -> "Deliveries":
         """Converts the arrivals of a log to arrivals for sites with different tick rates.
 
-        The network is assumed to be the same. Each sample of the new run is modelled on the
+        The network is assumed to be the same. Each sample of the new run corresponds to the
         last sample of the log that was not sent later. The new sample takes as long from its
-        time stamp to the tick of its arrival as its model did. If the model never arrived,
-        neither does the new sample.
+        time stamp to the tick of its arrival as this recorded sample did. If the recorded
+        sample never arrived, neither does the new sample.
 
         Args:
             rate_hz: Tick rate of the site in the log, in Hz.

@@ -5,8 +5,8 @@ For example, one can repeat a session with a higher damping at the slave:
     result = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
     result.sites["s"].error_rms_rad, result.after["s"].q
 
-In open loop, only the replaced sites are executed. The other sites keep their records and do
-not react. In closed loop, every site is executed, and each sample spends as much time in the
+In open loop, only the replaced sites are run again. The other sites keep their records and do
+not react. In closed loop, every site is run again, and each sample spends as much time in the
 network as it did in the log.
 
 Invariant:
@@ -183,10 +183,10 @@ def _compare_site_rerun(
     """Computes how a rerun differs at one arm, and on the links to this arm.
 
     Args:
-        log: The log that was re-executed.
-        request: Executed sites and changed settings of the rerun.
+        log: The log whose sites were run again.
+        request: Sites to run again, and changed settings.
         execution: The rerun, after its last tick.
-        name: Name of the executed site.
+        name: Name of a site that was run again.
         ticks: All ticks of this site in the rerun, in order of time.
 
     Returns:
@@ -308,18 +308,18 @@ def _compare_links(
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and the result of re-executing some or all of its sites.
+    """A log and the result of running some or all of its sites again.
 
     Created by the function `rerun`. The result can be displayed, written as a log of its own,
     or converted to plain values.
 
     Attributes:
-        before: The log that was re-executed.
-        request: Executed sites and changed settings.
-        ticks: Every tick of every executed site, in order of execution.
-        sites: Mapping from the name of each executed site to the effect on it.
-        links: Mapping from the name of each link that ends at an executed site to the effect on
-            it.
+        before: The log whose sites were run again.
+        request: Sites that were run again, and changed settings.
+        ticks: Every tick of these sites, in order of execution.
+        sites: Mapping from the name of each of these sites to the effect on it.
+        links: Mapping from the name of each link that ends at one of these sites to the effect
+            on it.
     """
 
     before: Log
@@ -331,7 +331,7 @@ class Rerun(Result):
     def headline(self) -> str:
         """Returns a one-line description of the rerun for the user.
 
-        It names the log, the kind of rerun, the executed sites and the changed settings.
+        It names the log, the kind of rerun, the sites run again and the changed settings.
         """
         changes = "; ".join(self.request.describe_changes()) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
@@ -341,7 +341,8 @@ class Rerun(Result):
     def after(self) -> Log:
         """The rerun as a log, which can be analysed like any other log.
 
-        Executed sites appear as newly computed, and all other sites as recorded.
+        Sites that were run again appear with their new records, and all other sites as
+        recorded.
         """
         stream = io.BytesIO()
         self.write(stream)
@@ -351,10 +352,10 @@ class Rerun(Result):
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
         """Writes the rerun to a stream as a log.
 
-        The log can be read, displayed and checked like that of a run. The records of executed
-        sites contain no measured values, such as computing times and round trips. Recorded
-        sites are copied byte for byte. The file states the SHA-256 hash of its source log, the
-        executed sites and the changes. Its scenario is that of the rerun.
+        The log can be read, displayed and checked like that of a run. The new records contain
+        no measured values, such as computing times and round trips. The records of sites that
+        were not run again are copied byte for byte. The file states the SHA-256 hash of its
+        source log, the sites run again and the changes. Its scenario is that of the rerun.
 
         Args:
             stream: Stream to which the log is written. It is not closed.
@@ -451,7 +452,7 @@ class Rerun(Result):
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a table of differences between the rerun and the recorded run, for JSON.
 
-        The table has one row per re-executed site.
+        The table has one row per site that was run again.
         """
         return list(self.to_dict()["sites"].values())
 
@@ -480,7 +481,7 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Re-executes sites of a log, usually with changed settings, and compares the results.
+    """Runs sites of a log again, usually with changed settings, and compares the results.
 
     The corresponding command is `trilat rerun`.
 
@@ -490,18 +491,18 @@ def rerun(
 
     Args:
         log: Log of a run, or the path of its file.
-        replace: Names of the sites to execute. All other sites keep their records and do not
+        replace: Names of the sites to run again. All other sites keep their records and do not
             react.
         set: Changed settings of these sites, for example `{"control.Kd": 5}`.
-        closed_loop: If True, all sites are executed, and `replace` must be empty.
+        closed_loop: If True, all sites are run again, and `replace` must be empty.
         progress: Function that is called from time to time with the number of executed ticks,
             and an upper bound on their total.
 
     Raises:
-        LogError: The log cannot be read, or does not contain enough to execute the sites.
-        UsageError: The sites are not named, or are named in two ways.
+        LogError: The log cannot be read, or lacks data that is needed to run the sites again.
+        UsageError: Both `replace` and `closed_loop` are given, or neither is.
         ScenarioError: There is no such site, or a change is invalid or cannot have an effect.
-        CodeWithheld: The control law of an executed site is code that may not run.
+        CodeWithheld: The control law of a site to run again is code that is not allowed to run.
     """
     before = log if isinstance(log, Log) else open_log(log)
     names = [replace] if isinstance(replace, str) else list(replace)
@@ -536,11 +537,11 @@ def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
     """Returns the metadata that states the origin of a rerun in its log.
 
     Args:
-        log: The log that was re-executed.
-        request: Executed sites and changed settings of the rerun.
+        log: The log whose sites were run again.
+        request: Sites that were run again, and changed settings.
 
     Returns:
-        A mapping from key to string: the source log, the executed sites and the changes.
+        A mapping from key to string: the source log, the sites run again and the changes.
     """
     digests = {}
     for source in log.sources:
@@ -561,7 +562,7 @@ def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[Site
     """Yields the messages of a site that a rerun copies from the source log, in order of time.
 
     The log of the rerun also contains the records, statistics and events of sites that were not
-    executed.
+    run again.
     """
     site_log = log[name]
     site_events = [event for event in log.events if event.member == name]
@@ -580,7 +581,7 @@ def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[Site
 def _make_executed_entries(
     ticks: Sequence[RerunTick], channels: SiteChannels
 ) -> Iterator[SiteEntry]:
-    """Yields the entries of an executed site, in order of time."""
+    """Yields the entries of a site that was run again, in order of time."""
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
         yield channels.make_record_entry(state, tick.payload)
@@ -642,8 +643,8 @@ def _describe_site_limits(effect: _SiteEffect, absent_ticks: int) -> Iterator[st
 
     There is one sentence for each of the following that applies:
 
-    - Ticks could not be executed because the log contains too little. The recorded results of
-      these ticks were copied.
+    - Ticks could not be executed because the log contains too little data. The recorded results
+      of these ticks were copied.
     - Ticks have no record. They were executed with estimated arrivals of samples.
     - The site had left the live session for some ticks, which are executed nevertheless.
     - Samples arrived that the log does not contain. The ticks were executed without them.

@@ -193,14 +193,14 @@ class SeveralHands:
 
     Args:
         count: Number L of runs.
-        most_ticks: Largest number of ticks of a span.
+        most_ticks: Largest number of ticks that one call of `advance` computes.
         rate_hz: Tick rate of the sites, Hz.
         period_ticks: Time between decisions, ticks.
 
     Attributes:
         arrays: State and limits of the hands.
-        actions: Grip, target, and target one second later, for each tick of the latest span and
-            each run, shape (ticks, 5, L).
+        actions: Grip, target, and target one second later, for each tick of the latest call of
+            `advance` and each run, shape (ticks, 5, L).
     """
 
     axes = AXES
@@ -257,7 +257,7 @@ class SeveralHands:
         return ""
 
     def begin(self, run: int, rules: HandRules) -> None:
-        """Resets the state of one simulation, in which the program does not yet hold its arm.
+        """Resets one simulation to a state in which the program does not yet hold its arm.
 
         Must be called for each simulation before its first tick.
 
@@ -296,7 +296,7 @@ class SeveralHands:
         Each simulation has one program and one arm.
 
         Args:
-            runs: Number of runs to advance, which are the first rows of the arrays.
+            runs: Number of runs to advance. Their values are the first entries of each array.
             first: First tick of each run, shape (L,).
             count: Number of ticks.
             is_idle: 1 for runs that are not advanced, shape (L,).

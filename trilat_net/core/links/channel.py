@@ -67,15 +67,15 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
 
     The link is in a good or a bad state, each with its own loss probability (Gilbert-Elliott
     model). From one sample to the next, it enters the bad state with probability `enter`, and
-    leaves it with probability `leave`. A new chain starts in its stationary distribution, in
-    which the bad state has probability enter / (enter + leave).
+    leaves it with probability `leave`. For the first sample, the state is drawn from the
+    stationary distribution, in which the bad state has probability enter / (enter + leave).
 
     Args:
-        u: Uniform random number that determines the state of the chain.
+        u: Uniform random number that determines the state of the link.
         v: Uniform random number that determines the loss.
         fresh: True for the first sample of the model.
         link: State of the link; updated in place.
-        model: Model in force, which must be one that loses samples.
+        model: Model in force, for which `loses_samples` is True.
     """
     if fresh:
         # The test is a product, not a quotient, because enter + leave may be zero.
@@ -143,7 +143,7 @@ def find_due_ns(
     """Computes when a network link delivers a message, after its loss and delay were drawn.
 
     Outages, duplicates and message ordering are taken into account here. Must be called exactly
-    once per sample, in the order of the indices.
+    once per sample, in order of increasing index.
 
     Args:
         sample: Index of the sample.

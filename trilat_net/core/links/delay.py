@@ -47,7 +47,7 @@ class DelayKind(IntEnum):
     - SINE: location + scale sin(2 pi t / extra + weight).
     - TRACE: a table of delays over time.
     - MEASURED: no delay is injected; a sample is used as soon as it arrives.
-    - CUSTOM: a compiled function in a file of its own; never above `location`.
+    - CUSTOM: computed by a user's compiled function; at most `location`.
     """
 
     CONSTANT = 0
@@ -392,7 +392,7 @@ _LOOP = int(_TraceEnd.LOOP)
 
 @leaf
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
-    """Draws a random delay from a distribution without memory, in us and not rounded.
+    """Draws a random delay that does not depend on earlier delays, in us and not rounded.
 
     The random numbers are a function of key, sample and purpose, so the same arguments always
     give the same delay. `DelayKind` defines the model parameters `location`, `scale`, `extra`
@@ -406,7 +406,8 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
         model: Delay model, a row of LINK_MODEL_DTYPE.
 
     Returns:
-        The delay. If the model has no such distribution, it is the constant `location`.
+        The delay. It is the constant `location` for kinds other than UNIFORM, NORMAL, GAMMA,
+        LOG_NORMAL and HYPER_EXPONENTIAL.
     """
     location: float = model.location
     scale: float = model.scale
@@ -486,7 +487,8 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     """Returns the delay of a sample on a link that follows a recorded delay trace.
 
     The delay is read from the last point of the trace at or before the sending time. A trace
-    that loops starts again after its last point, which lasts as long as the one before it.
+    that loops starts again after its last point, which applies for as long as the point before
+    it.
 
     Args:
         stamp_ns: Time at which the sample was sent, ns since the start of the session.

@@ -89,7 +89,7 @@ class LinkArrays(NamedTuple):
         dues: Times at which the newest samples are to be delivered, in ns since the start of
             the session, or LOST for a lost sample. This is a ring buffer: sample m is at index
             m modulo the length. After the sample has arrived, the entry becomes `_FILED` minus
-            the time.
+            the delivery time.
         calendar: Ring buffer of the samples whose delay has not passed, see `sample_dtype`.
         points: Traces and outages of all links of the receiver, shape (n, 2).
         channel: Additional values sent by the peer's control law. None if the receiver's law
@@ -255,7 +255,7 @@ def accept_sample(
     sent: Array,
     link: LinkArrays,
 ) -> None:
-    """Stores a message that arrived from another arm until its simulated delay has passed.
+    """Stores a message received from another arm until its simulated delay has passed.
 
     A message that arrives after its delivery time is used in the current tick, unless a newer
     one is already in use. Messages that cannot be used are counted as rejected, lost or
@@ -322,14 +322,15 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Starts to use the newest message from another arm whose simulated delay has passed.
+    """Starts using the newest message from another arm whose simulated delay has passed.
 
     If no message is due in tick k, the previous one stays in use. Must be called once per
     control period of the receiver, in order. Otherwise, messages stored by `accept_sample`
     would stay in the calendar, which has one page per period.
 
     Delivery times are computed here for all messages sent up to the time t_k of the tick, which
-    ensures that the first message after a long silence costs no more than any other.
+    ensures that the first message after a long silence takes no longer to process than any
+    other.
 
     Args:
         k: Tick of the receiver.

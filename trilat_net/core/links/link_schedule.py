@@ -32,8 +32,7 @@ class LinkSchedule:
 
     Args:
         setup: Setup of the link, as read by the kernel.
-        changed_models: Delay and loss models that the link acquires through changes during the
-            run.
+        changed_models: Delay and loss models to which the link is changed during the run.
 
     Attributes:
         models: All models of the link, ordered by start time.
@@ -100,7 +99,7 @@ class LinkSchedule:
             stamp_ns: Sending times of the messages, ns since the epoch, shape (M,).
 
         Returns:
-            One truth value per message, shape (M,).
+            One Boolean per message, shape (M,).
         """
         model_index = np.searchsorted(self.models["from_ns"][1:], stamp_ns, side="right")
         is_measured: NDArray[np.bool_] = self.models["kind"][model_index] == DelayKind.MEASURED

@@ -152,9 +152,9 @@ def law_stage(
 
 
 class LawForm(NamedTuple):
-    """Data types for which a user's control law is compiled, for example the number of joints.
+    """Data types, and the number of peers, for which a user's control law is compiled.
 
-    Two laws of the same class with equal types share the compiled code.
+    Two laws of the same class with equal forms share the compiled code.
 
     Attributes:
         law: Names and shapes of the law's gains and memory.

@@ -97,11 +97,11 @@ class LawChannel(NamedTuple):
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Counts the values of the vectors that go to all peers, or to each single peer.
+        """Counts the values that the law sends to all peers alike, or to one peer alone.
 
         Args:
-            per_peer: True to count the values that differ between peers, for a single peer.
-                False to count the values that are the same for all peers.
+            per_peer: True to count the values for one peer in the vectors that differ between
+                peers. False to count the values that are the same for all peers.
         """
         return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
 

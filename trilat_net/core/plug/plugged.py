@@ -35,7 +35,7 @@ _PLAIN: dict[int, Callable[..., None]] = {}
 
 @intrinsic
 def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
-    """Generates the call of a compiled function by its address. The function returns nothing.
+    """Generates a call to a compiled function at an address. The function returns nothing.
 
     Numba calls this while compiling a caller of `call_address`. An exception raised by the
     called function propagates to its caller.
@@ -51,7 +51,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
     """
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Generates the LLVM code of the call `function(*arguments)` by the function's address.
+        """Generates LLVM code that calls a function at an address, as `function(*arguments)`.
 
         Because the address is a runtime value, the compiled caller does not depend on the
         function and need not be recompiled for another function. Numba calls `generate` while

@@ -107,7 +107,7 @@ class LawVector(list[Any]):
 
 
 class PeerView(NamedTuple):
-    """Data about a peer that a control law has in one tick.
+    """Data about a peer that a control law can read in one tick.
 
     The data come from the newest sample whose network delay has passed. Before the first
     sample, they describe the start pose of the peer, at rest.

@@ -87,9 +87,9 @@ class RunTotals(NamedTuple):
     """Summary statistics of a simulated run, as returned by `CompiledRun.totals`.
 
     Attributes:
-        rms_error_rad: Root mean square of the synchronisation error e over the run, in rad. e
-            is the difference between a joint angle and its reference. This is the maximum over
-            all joints of all sites.
+        rms_error_rad: Root mean square over the run of the synchronisation error e, which is
+            the difference between a joint angle and its reference, in rad. The value is the
+            largest of all joints of all sites.
         effort_nm: Root mean square of tau - G(q) over sites and joints, in N m, where tau is
             the control torque and G(q) the torque that compensates for gravity in pose q.
         force_peak_n: Largest force exerted by a wall on an arm, in N. None if there is no wall.

@@ -243,7 +243,8 @@ def update_peaks(
         t_ns: Nominal time of the control period, ns since the start of the session.
         settled_rad: Position error below which the arm counts as settled, rad.
         s: State of the site.
-        progress: Progress of the site, in which the time of the last larger error is updated.
+        progress: Progress of the site. Its field `unsettled_ns`, the last time at which an
+            error was not below `settled_rad`, is updated.
         peaks: Peaks of the current interval, see `run_until`, shape (3 n,).
         sums: Sums over all records of the site.
     """
@@ -361,17 +362,17 @@ def update_sums(
 ) -> None:
     """Adds a control period to the sums of an arm's motor effort and its environments' work.
 
-    The effort is the sum of the squared torques beyond gravity. The work in a control period is
-    the torque times the change in the joint angles q. For a torque that varies during the
-    period, the mean of its values at both ends is used (trapezoidal rule). The constant torque
-    is added.
+    The effort is the sum of the squares of control torque minus gravity torque. The work in a
+    control period is the torque times the change in the joint angles q. For a torque that
+    varies during the period, the mean of its values at both ends is used (trapezoidal rule). A
+    torque that is constant during the period is added to this mean.
 
     Args:
         k: Tick to add.
         t_ns: Nominal time of the tick, ns since the start of the session.
         s: State of the site.
         chain: Data of the joints, one row per joint. None for the planar two-link arm.
-        environments: Environments that the arm may touch, excluding its operators.
+        environments: Torque sources of the arm that are environments, not operators.
         table: Tables of all operators and environments, for example of recorded torques.
         row: Floating-point values of the record of this tick.
         sums: Sums over all records of the site; updated in place.

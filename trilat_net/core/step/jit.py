@@ -906,8 +906,8 @@ def compile_named(
 
     If a closure with this name was compiled before, its code is loaded instead. The name must
     therefore be derived from everything that the code depends on, including the variables
-    captured by the closure. It is also used for the symbols in the machine code, so no two such
-    functions in a process may share a name.
+    captured by the closure. The name also appears in the symbols of the machine code, so no two
+    functions compiled in this way may share a name within a process.
 
     Args:
         function: The closure. Its qualified name is changed to `name`.

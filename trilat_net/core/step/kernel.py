@@ -478,7 +478,7 @@ def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stores the messages that arrived until their simulated network delay has passed.
+    """Stores newly arrived messages until their simulated network delay has passed.
 
     The ring buffers in which messages wait are called calendars.
 

@@ -40,7 +40,7 @@ class RunInputs(NamedTuple):
         """Returns the inputs of a run that receives nothing from outside.
 
         In such a run, every sample arrives promptly, in the first tick after it was sent. No
-        setting changes, and no live operator moves an arm. Link delays from the setup still
+        settings change, and no live operator moves an arm. Link delays from the setup still
         apply, because they are simulated by the receivers.
 
         Args:

@@ -121,8 +121,8 @@ class SiteArrays(NamedTuple):
 
         Args:
             setup: Setup of the site.
-            spare: Number of free rows for changes during the run, first for changes of each
-                link's delay model, then for changes of the dominance factors.
+            spare: Numbers of free rows for changes during the run: in each link's table of
+                models, and in the table of dominance ramps.
             pages: Number of samples that can wait on each link, which is also the number of
                 delivery times stored per link. 0 to derive both from the setup.
             layout: Lengths of the vectors in the arrays, if they must be larger than this site
@@ -299,7 +299,7 @@ class SiteArrays(NamedTuple):
         Args:
             change: The change.
             t_ns: Current time in ns since the start of the session. The site will not compute
-                control periods before this time any more.
+                any further control period that starts before this time.
 
         Raises:
             ValueError: A table has no free row for the change.
@@ -428,8 +428,8 @@ class CalendarSizer:
     """Enlarges the ring buffers of delayed samples when a sample arrives that does not fit.
 
     Samples wait in a buffer until their simulated delay has passed. A buffer is too short if
-    delays have increased, or if the peer's clock is far ahead. The buffers never use more
-    memory than `MAX_LINKS_BYTES`, or than the delays in the setup require. A sample that still
+    delays have increased, or if the peer's clock is far ahead. The links never use more memory
+    than `MAX_LINKS_BYTES`, unless the delays in the setup require more. A sample that still
     does not fit is rejected later.
 
     Attributes:
@@ -450,7 +450,7 @@ class CalendarSizer:
             self.most_pages *= 2
 
     def clear(self) -> None:
-        """Discards the knowledge of which messages fit into the ring buffers of the links.
+        """Forgets which messages are known to fit into the ring buffers of the links.
 
         The next message of each sender will be checked again.
         """
@@ -488,14 +488,15 @@ class CalendarSizer:
 
         The sample waits in the buffer until its simulated delay has passed. The buffer has one
         entry (page) for the current tick and one for each later tick of the receiver. The
-        sample fits if there is a page for the last tick in which it may first be used. This
+        sample fits if there is a page for the latest tick in which it may come into use. This
         tick is at most `ahead` + `longest_wait` ticks away: the sample was sent `ahead` ticks
         after the current tick (negative for an earlier sample), and then waits for at most
         `longest_wait` ticks.
 
         If the peer's clock is too far ahead, the buffer is not enlarged, and the sample is
         rejected later. Otherwise, `newest` is set to the newest sample of the peer that fits
-        into the buffer at its current size. Samples up to `newest` need no call of this method.
+        into the buffer at its current size. The method need not be called for samples up to
+        `newest`.
 
         Args:
             arrays: Arrays of the receiving site.

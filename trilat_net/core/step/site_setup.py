@@ -52,7 +52,7 @@ LEAST_STOP_S = 0.1
 
 
 class StaleAction(IntEnum):
-    """What a site does while a peer has been silent for too long.
+    """What a site does when a peer has been silent for too long.
 
     USE follows the last known state of the peer. HOLD freezes the reference at its last value.
     BRAKE keeps the pose that the arm had when the peer fell silent. GLIDE brings the arm
@@ -67,13 +67,14 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """What a site does when a peer is stale, meaning that no new sample arrived for too long.
+    """What a site does when a peer is stale: no new sample has arrived from it for too long.
 
     Attributes:
         action: Reaction of the site while a peer is stale.
         age_ns: Largest age of the newest sample, ns. For GLIDE, the longest time since a new
             sample could be used.
-        return_ns: Duration of the return to the peers' reference, ns. Not used for GLIDE.
+        return_ns: Duration of the return to the reference computed from the peers, ns. Not used
+            for GLIDE.
         align_speed: For GLIDE: largest speed at which the arm returns to its peers, rad/s or
             m/s.
         align_limit: For GLIDE: largest distance over which the arm may return, rad or m.
@@ -104,7 +105,7 @@ class StaleRule(NamedTuple):
         Args:
             action: "use", "hold" or "brake", see `StaleAction`.
             age_ns: Largest age of the newest sample, ns.
-            return_ns: Duration of the return to the peers' reference, ns.
+            return_ns: Duration of the return to the reference computed from the peers, ns.
         """
         return cls(StaleAction[action.upper()], age_ns, return_ns)
 
@@ -245,7 +246,8 @@ class TaskSetup(NamedTuple):
             0. Three coordinates are a position, and six are a pose.
         scale: Size of the shared coordinates relative to this arm: with a scale of 2, moving
             this arm by 1 m counts as 2 m.
-        posture: Joint angles that the arm prefers where the end effector leaves a choice, rad.
+        posture: Preferred joint angles, which the arm approaches as far as the motion of the
+            end effector allows, rad.
         posture_rate: Rate at which the arm approaches these angles, 1/s.
         singular_value: Threshold for damping the Jacobian near a singular pose: it is damped
             where its smallest singular value may fall below this value, m/rad.

@@ -229,7 +229,7 @@ class Site:
         Args:
             command: The change.
             t_ns: Current time in ns since the start of the session. The site will not compute
-                control periods before this time any more.
+                any further control period that starts before this time.
 
         Raises:
             ValueError: There are too many planned changes.
@@ -270,8 +270,8 @@ class Site:
         The same input therefore always produces the same results.
 
         Args:
-            tick: Number of the period, which must follow that of the previous call, and its
-                inputs.
+            tick: Number and inputs of the period. The number must follow that of the previous
+                call.
 
         Returns:
             The record of the period: its inputs and results.
@@ -614,7 +614,7 @@ class Site:
         The field `mem` of a record contains the state variables of the site and its law that no
         other field contains. For m coordinates shared between sites, these are
 
-        - the held reference (m values) and the time since when it is held, ns,
+        - the held reference (m values), and the time since which it has been held, ns,
         - under the rule `glide` (where an arm comes to rest while a peer is silent), the
           additional values read by `_restore_life`,
         - the memory of the user's law, if there is one.
@@ -624,7 +624,7 @@ class Site:
         Args:
             before: Record of the control period before `last`. If `last` is the first record,
                 any record can be passed.
-            last: Last record of the part that is not recomputed.
+            last: Record of the last control period before those that `step` will compute.
         """
         s: Row = self._site[0]
         shared = self.layout.shared
@@ -667,8 +667,8 @@ class Site:
         - `gone`, only if the site continues without lost peers: the state of each peer.
 
         Args:
-            memory: Contents of `mem`, after the held reference and the time since when it is
-                held.
+            memory: Contents of `mem`, after the held reference and the time since which it has
+                been held.
 
         Returns:
             The remaining values, which belong to the user's law.

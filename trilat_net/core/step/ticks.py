@@ -161,7 +161,7 @@ class CoreChange(NamedTuple):
     stop.
 
     Attributes:
-        text: Description stored in the record, from which every reader can derive the same
+        text: Description stored in the record, from which any reader can reconstruct the
             change.
         peer: Index of the peer whose link changes; -1 for other changes.
         model: New model of the link.
@@ -276,8 +276,8 @@ _REASONS = {
 class LifeAlarm(NamedTuple):
     """An alarm that explains why an arm is not following the others, and how to fix it.
 
-    It is created by `LifeAlarm.find`. Web pages and terminals show it while the arm stays in
-    this mode.
+    It is created by `LifeAlarm.find`. Web pages and terminals show it as long as the site needs
+    attention.
 
     Attributes:
         word: The mode, in capitals.
