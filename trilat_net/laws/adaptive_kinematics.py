@@ -140,7 +140,7 @@ def _jacobian_rate_times(
 
 @compiled
 class AdaptiveKinematics(ControlLaw):
-    """The paper's law for end-effector positions of planar arms with unknown lengths.
+    """Adaptive law for end-effector positions of planar arms with unknown lengths.
 
     The positions and velocities of the end effectors are measured and compared in a common
     frame. Masses and lengths are learnt.
@@ -151,7 +151,7 @@ class AdaptiveKinematics(ControlLaw):
     Attributes:
         Lambda: Rate at which errors decay, per coordinate x and y, 1/s.
         Kp: Damping of r, per joint, N m s/rad.
-        Kd: Damping of the error's velocity, per coordinate, N s/m.
+        Kd: Damping of the error, per coordinate, N s/m.
         Gamma: Adaptation gain per parameter.
         theta_hat0: Initial estimate of theta, Eq. (24).
         length_gain_m_n: Adaptation gain of the lengths, m/N.
@@ -325,8 +325,8 @@ class AdaptiveKinematics(ControlLaw):
             situation: This arm, the other arms, their laws, and the delays between them.
 
         Returns:
-            The condition, as text. It is never decided (`holds` is None), because only a run
-            shows whether the elbows stay bent.
+            The condition, as text. Its `holds` is always None, because only a run shows whether
+            the elbows stay bent.
         """
         if np.isnan(situation.longest_s):
             return StabilityCondition(

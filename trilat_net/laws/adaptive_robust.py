@@ -26,9 +26,10 @@ class AdaptiveRobust(AdaptiveBox):
 
     Here r is the filtered tracking error. The stability result assumes constant delays, no
     operators, parameters within their bounds, and a disturbance of at most rho at each joint.
-    Under these premises, the time average of the power dissipated from V (the energy function
-    of the stability proof) is at most 0.3003 sum_i beta_i sum rho width. No stronger statement
-    is proved. The bound is derived in docs/reference/laws-adaptive.md.
+    Under these premises, the power dissipated in V (the energy function of the stability proof)
+    is, averaged over time, at most 0.3003 times the sum of beta_i rho width over the joints of
+    all sites i, where beta_i is the weight of site i in V. No stronger statement is proved. The
+    bound is derived in docs/reference/laws-adaptive.md.
 
     Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 
@@ -59,7 +60,8 @@ class AdaptiveRobust(AdaptiveBox):
 
         Kp and Kd are damping gains in N m s/rad, and `friction` is the fraction of the friction
         f(v) that the law compensates for. The last term, the robust term, counteracts
-        disturbances of up to rho (N m) and is smooth for errors below `width` (rad/s).
+        disturbances of up to rho (N m). It changes sign smoothly, within about `width` (rad/s)
+        on either side of r = 0.
 
         Args:
             Y: Regressor of the arm's dynamics, shape (n, P), for n joints and P parameters.
@@ -139,8 +141,9 @@ class AdaptiveRobust(AdaptiveBox):
         """Returns the scenario table [control] of this law for one arm, with tuned gains.
 
         While the filtered error r is small, the robust term -rho r / sqrt(r^2 + width^2) acts
-        like a damping rho / width, where rho (N m) is the largest disturbance. The width
-        (rad/s) is chosen such that this damping is a tenth of the gain Kp.
+        like a damper with the coefficient rho / width, where rho (N m) is the largest
+        disturbance. The width (rad/s) is chosen such that this coefficient is a tenth of the
+        gain Kp.
 
         Args:
             gains: Mapping from gain name to tuned value, with rho as `rho_nm`.

@@ -7,9 +7,9 @@ other user, but not the force that the environment exerts on the slave:
     user i   tau = G + K alpha_ij (q_j - q_i) - d qd_i,    j: the other user
 
 where tau is the torque of an arm, G its gravity torque, q its position, K a stiffness, d a
-damping, and alpha_j are the dominance factors. A user i whose share of the authority is a has
-alpha_ij = 1 - a, so the user with less authority is guided more strongly. A user's torque does
-not depend on the slave.
+damping coefficient, and alpha_j are the dominance factors. A user i whose share of the
+authority is a has alpha_ij = 1 - a, so the user with less authority is guided more strongly. A
+user's torque does not depend on the slave.
 """
 
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ class Authority(ControlLaw):
 
     Attributes:
         K: Stiffness per joint, N m/rad.
-        d: Damping of the arm's velocity, per joint, N m s/rad.
+        d: Damping of the arm's motion, per joint, N m s/rad.
         leads: True if the other arms follow this arm: true for a user, false for the slave.
         gravity: Ratio of the compensated to the true gravity torque. 1 is exact.
     """
@@ -54,8 +54,8 @@ class Authority(ControlLaw):
         """Computes the torque of the arm in one tick.
 
         Springs pull the arm towards the arms of the users. Each site sends the flag `leads`,
-        which is 1 for a user and 0 for the slave, and springs act only towards sites whose flag
-        is 1.
+        which is 1 for a user and 0 for the slave, and springs pull only towards the arms of
+        sites whose flag is 1.
 
         Args:
             now: Inputs and outputs of the law in this tick. The torque is written into

@@ -91,8 +91,8 @@ class LawSituation(NamedTuple):
             if it varies.
         tau_limit_nm: Largest torques of the site's joints, N m.
         rate_hz: Tick rate of the site, Hz.
-        gravity_nm: Largest gravity torque of the site's planar arm, N m per joint; () for a
-            chain.
+        gravity_nm: Largest gravity torque of the site's planar arm, N m per joint; () for an
+            arm from a URDF file.
         hold_s: Duration for which a torque is held, s: one tick with the scheme `digital`, NaN
             if tick rates differ between sites, otherwise 0 as in continuous time.
         actors: For each site, the operators and environments of its arm. () if nothing is known
@@ -116,7 +116,7 @@ class LawSituation(NamedTuple):
 
     @property
     def longest_s(self) -> float:
-        """Longest delay of the links from the arms that this arm follows, s.
+        """Longest delay of the links over which an arm follows another, s.
 
         NaN if any of these delays varies.
         """
@@ -127,11 +127,11 @@ class LawSituation(NamedTuple):
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
         """Returns the facts as if only some of the sites took part in the session.
 
-        Used by laws that follow only some of the other arms, and evaluate their stability
-        condition for these arms alone.
+        Used by laws under which an arm follows only some of the other arms, to evaluate the
+        stability condition for these arms alone.
 
         Args:
-            sites: Indices of the sites to keep. The site of these facts must be among them.
+            sites: Indices of the sites to keep. `self.site` must be among them.
         """
         submatrix = np.ix_(sites, sites)
         return self._replace(
@@ -147,8 +147,8 @@ class LawSituation(NamedTuple):
     def list_loads(self) -> list[tuple[ArmLoad, ...] | None]:
         """Returns the springs and dampers that react to the motion of each arm.
 
-        None for an arm with another reaction, see `ArmLoad.list_of_actors`, and for all arms if
-        nothing is known about any of them.
+        The entry of an arm is None if an actor reacts to its motion in any other way, see
+        `ArmLoad.list_of_actors`. All entries are None if nothing is known about any actors.
         """
         if not self.actors:
             return [None] * len(self.laws)
@@ -250,8 +250,8 @@ def _judge_two_sites(
 
         4 d1 d2 >= (T1 + T2)^2 K1 K2
 
-    K1 and K2 are the stiffnesses of the two springs, d1 and d2 the dampings of the two arms,
-    and T1 + T2 the sum of the delays in both directions.
+    K1 and K2 are the stiffnesses of the two springs, d1 and d2 the damping coefficients of the
+    two arms, and T1 + T2 is the sum of the delays in both directions.
 
     Holding a torque for the period h delays it by h / 2 on average. Therefore each d is reduced
     by K h / 2, and the sum of the delays is increased by h. Each stiffness is multiplied by the
@@ -267,7 +267,7 @@ def _judge_two_sites(
 
     Returns:
         The condition with its numerical values. It holds if it is satisfied at every joint, and
-        no damping is negative after the reduction.
+        no damping coefficient is negative after the reduction.
     """
     hold_s = situation.hold_s
     alpha = situation.alpha
@@ -445,7 +445,7 @@ class LinearForm:
     def list_forms(
         names: tuple[str, ...], laws: tuple[Any, ...], alpha: Array, inertia: Sequence[Array]
     ) -> "list[LinearForm | None]":
-        """Returns the linear terms that the gains of the laws of all sites cannot express.
+        """Returns, for each site, the linear terms that the gains of its law cannot express.
 
         Args:
             names: Names of the sites.

@@ -173,7 +173,7 @@ class FourChannel(ControlLaw):
             _send_acceleration(self, now)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of spring, damper and felt torque for the linear analysis.
+        """Returns the gains of the spring, damper and felt torque for the linear analysis.
 
         The gains refer to the built-in law tau = G - K e - Kd ed + k_f felt, where G is the
         gravity torque, e the position error, ed its derivative and `felt` the torque on the

@@ -64,7 +64,7 @@ class Impedance(ControlLaw):
     needs_model: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: allocates its start pose and its desired acceleration.
+        """Prepares the law before a run: allocates lists for its start pose and acceleration.
 
         The measured pose is stored as the start pose in the first tick.
 
@@ -211,7 +211,7 @@ class Impedance(ControlLaw):
           per joint.
 
         The condition is not satisfied if there is not exactly one slave, if a site uses another
-        law, or if a damping is zero.
+        law, or if a damping coefficient is zero.
 
         Args:
             situation: All sites, their laws, the operators and environments of their arms, and
@@ -286,7 +286,7 @@ class Impedance(ControlLaw):
         limits and discrete-time control.
 
         Args:
-            run: The motion of all arms in the run of a candidate.
+            run: The motion of all arms in a tuning run.
 
         Returns:
             Joint angles of the model, shape (N, K, n), in rad. None if a site uses another law,
@@ -513,7 +513,7 @@ def move_impedance(law: Any, force: Array, period_s: float) -> Array:
 
     Args:
         law: Settings of the law, which contain M, B and K.
-        force: The force, shape (K, n), in N m.
+        force: The force on the mass, given as a joint torque, shape (K, n), in N m.
         period_s: Time between successive values of the force, in s.
 
     Returns:

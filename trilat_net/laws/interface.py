@@ -115,7 +115,9 @@ class LawSettings(Frozen, frozen=True):
     has_functional: ClassVar[bool] = False
     """True if the energy function V of the paper's stability proof applies to the law."""
     planar: ClassVar[bool] = False
-    """True if the law uses the planar arm's regressor and therefore cannot control a chain."""
+    """True if the law uses the planar arm's regressor and therefore cannot control an arm from
+    a URDF file.
+    """
     needs_joint_space: ClassVar[bool] = False
     """True if the law combines values per joint with values per shared coordinate. Such a law
     cannot control arms that share end effector positions.
@@ -251,7 +253,7 @@ class LawSettings(Frozen, frozen=True):
         and its gains are tuned for arms that follow that motion.
 
         Args:
-            run: The motion of all arms in the run of a candidate.
+            run: The motion of all arms in a tuning run.
 
         Returns:
             Joint angles of the desired motion, shape (N, K, n), in rad. None if the arms should
@@ -321,12 +323,13 @@ class LawSettings(Frozen, frozen=True):
         """Returns the gains of a law that is only a spring and a damper, equal at all joints.
 
         Returns:
-            Stiffness K in N m/rad and damping d in N m s/rad. None for other laws and gains.
+            Stiffness K in N m/rad and damping d in N m s/rad. None for any other law, and for
+            gains that differ between joints.
         """
         return None
 
     def find_sampling_excess(self, g_m_s2: float, tick_s: float) -> float | None:  # noqa: ARG002
-        """Returns by how much a gain exceeds what the tick rate requires.
+        """Returns by how much a gain exceeds the minimum that the tick rate requires.
 
         Overridden by laws that may be unstable because they act only once per tick.
 

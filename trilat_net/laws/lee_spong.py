@@ -1,8 +1,9 @@
 """The control law of Lee and Spong, which computes its damping from the largest delay.
 
 In the law PD+d, a spring (P) and a damper (D) couple an arm to the arms that it follows, and a
-second damper (d) brakes the arm itself. Here the second damping is computed from the spring
-stiffness and the largest delay, so the user specifies a delay instead of a damping.
+second damper (d) brakes the arm itself. Here the coefficient of the second damper is computed
+from the spring stiffness and the largest delay, so the user specifies a delay instead of a
+damping coefficient.
 
 The compiled control loop computes this law (`core.step.control.damped_torque`).
 `LeeSpong.compute_torque` implements the same law in plain Python, and
@@ -31,7 +32,7 @@ class LeeSpong(ControlLaw):
 
     Attributes:
         K: Stiffness per joint, N m/rad.
-        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        Kd: Damping of the error, per joint, N m s/rad.
         T_max_ms: Half of the longest round trip, ms.
         P_e: Damping in addition to the damping required by the delay, per joint, N m s/rad.
         gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
@@ -48,7 +49,7 @@ class LeeSpong(ControlLaw):
 
     @property
     def damping(self) -> tuple[float, ...]:
-        """Damping d = K T_max + P_e of the arm's velocity per joint, N m s/rad.
+        """Damping d = K T_max + P_e of the arm's motion per joint, N m s/rad.
 
         K is the stiffness, T_max half of the longest round trip, and P_e the additional
         damping.
@@ -82,8 +83,9 @@ class LeeSpong(ControlLaw):
     def gains(self, theta: Array) -> Gains:
         """Converts the gains of this law to the record that the compiled control loop reads.
 
-        The record contains the stiffness, both dampings, and the parameters needed to compute
-        the gravity torque. The damping of the arm is given by the property `damping`.
+        The record contains the stiffness, both damping coefficients, and the parameters needed
+        to compute the gravity torque. The damping of the arm is given by the property
+        `damping`.
 
         Args:
             theta: The P dynamic parameters of the arm, such as masses, shape (P,).

@@ -85,7 +85,7 @@ class PD(ControlLaw):
     def find_uniform_spring(self) -> tuple[float, float] | None:
         """Returns K in N m/rad and d in N m s/rad, if each is the same for all joints.
 
-        None for different gains, or if gravity compensation is not exact.
+        None if the joints have different gains, or if gravity compensation is not exact.
         """
         is_uniform = len({*self.K}) == 1 and len({*self.d}) == 1
         if self.gravity != 1.0 or not is_uniform:

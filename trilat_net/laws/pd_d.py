@@ -29,8 +29,8 @@ class PdD(ControlLaw):
 
     Attributes:
         K: Stiffness per joint, N m/rad.
-        Kd: Damping of the error's velocity, per joint, N m s/rad.
-        d: Damping of the arm's velocity, per joint, N m s/rad.
+        Kd: Damping of the error, per joint, N m s/rad.
+        d: Damping of the arm's motion, per joint, N m s/rad.
         gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
@@ -64,8 +64,8 @@ class PdD(ControlLaw):
     def gains(self, theta: Array) -> Gains:
         """Converts the gains of this law to the record that the compiled control loop reads.
 
-        The record contains the stiffness, both dampings, and the parameters needed to compute
-        the gravity torque.
+        The record contains the stiffness, both damping coefficients, and the parameters needed
+        to compute the gravity torque.
 
         Args:
             theta: The P dynamic parameters of the arm, such as masses, shape (P,).

@@ -31,7 +31,7 @@ class SaturatedPd(ControlLaw):
     Attributes:
         K: Stiffness for small errors, per joint, N m/rad.
         P: Largest pull of all peers together, per joint, N m.
-        d: Damping of the arm's velocity, per joint, N m s/rad.
+        d: Damping of the arm's motion, per joint, N m s/rad.
         gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
 
@@ -100,10 +100,10 @@ class SaturatedPd(ControlLaw):
         """Evaluates the stability of this law, and whether its torques stay within limits.
 
         The condition for a linear spring of stiffness K with a damper applies at any resting
-        pose, even if sites are held apart. It is not enough that the spring is nowhere stiffer
-        than K. The proof uses the fact that the slopes of the hyperbolic tangents form a
-        positive semidefinite matrix, and applies the Schur product theorem
-        (docs/theory/damping-conditions.md, 13).
+        pose, even if sites are held apart. This does not follow merely from the fact that the
+        spring is nowhere stiffer than K. The proof uses the fact that the slopes of the
+        hyperbolic tangents form a positive semidefinite matrix, and applies the Schur product
+        theorem (docs/theory/damping-conditions.md, 13).
 
         If the gravity torque of the arm is known, the torque limit of each joint must exceed
         the sum of the gravity torque and the largest spring torque P. The text of the condition

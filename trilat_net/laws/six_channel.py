@@ -45,8 +45,8 @@ class SixChannel(FourChannel):
         Returns:
             If the dominance factors are not consistent with a single factor, a condition that
             is not satisfied. Otherwise the condition of the four-channel law, which may be
-            undecided. Its text begins with a and the weights beta with which the operators'
-            torques add up to zero at rest.
+            undecided. Its text begins with the value of a and the weights beta with which the
+            operators' torques add up to zero at rest.
         """
         if len(situation.alpha) != 3:
             return StabilityCondition(False, "this law is for two users and a slave")

@@ -11,7 +11,8 @@ arm.
     model    inertia x'' = K (q_m - x) - d x'
 
 Here q_m, q_s, qd_m and qd_s are the positions and velocities of master and slave, tau is the
-torque of an arm and G its gravity torque, T is the delay, K a stiffness and d a damping.
+torque of an arm and G its gravity torque, T is the delay, K a stiffness and d a damping
+coefficient.
 Because both sites run the same model, no past values need to be stored, however long the delay
 is. The signal w is the part of the slave's motion that the model does not predict, for example
 in contact. The master is the site with `predicts` = true.
@@ -45,7 +46,7 @@ class Smith(ControlLaw):
 
     Attributes:
         K: Stiffness per joint, N m/rad.
-        d: Damping of the arm's velocity, per joint, N m s/rad.
+        d: Damping of the arm's motion, per joint, N m s/rad.
         inertia: Inertia of the slave's model, per joint, kg m^2. K, d and inertia must be the
             same at both sites.
         predicts: True for the master.

@@ -181,7 +181,7 @@ class Sync(ControlLaw):
         to rest at the pose to which the operators pull them.
 
         Args:
-            run: The motion of all arms in the run of a candidate.
+            run: The motion of all arms in a tuning run.
 
         Returns:
             The mean over the arms, repeated for each arm, shape (N, K, n), in rad. None if a

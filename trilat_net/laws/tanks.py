@@ -37,8 +37,8 @@ class Tanks(EnergyLaw):
 
     Attributes:
         K: Stiffness of the spring to the reference, per joint, N m/rad.
-        Kd: Damping of the error's velocity, per joint, N m s/rad.
-        d: Damping of the arm's velocity, per joint, N m s/rad.
+        Kd: Damping of the error, per joint, N m s/rad.
+        d: Damping of the arm's motion, per joint, N m s/rad.
         level_J: Level to which a tank is refilled, J.
         fill_nm_s_rad_J: Damping of the arm per unit of energy missing from the tank, N m
             s/rad/J. This damping refills the tank from the motion of the arm.

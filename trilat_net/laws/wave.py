@@ -492,7 +492,7 @@ class Wave(EnergyLaw):
     tune: ClassVar = {"b": DAMPING, "K": STIFFNESS}
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run by creating the state of its lines, with no waves.
+        """Prepares the law before a run by creating its lines, which carry no waves yet.
 
         Lists with one entry per line and joint are flat: joint i of peer j has the index j n +
         i, where n is the number of joints.

@@ -27,7 +27,7 @@ class LogQuality(NamedTuple):
     """How much of a run a log shows, and whether the log can be trusted.
 
     Attributes:
-        coverage: Recorded ticks and expected ticks of every site.
+        coverage: Numbers of recorded and expected ticks of every site.
         integrity: Whether the log is unmodified since it was written.
         copied_sites: Sites that did not react to the other sites, because the run is a
             repetition in which their motion was copied from an earlier run.
@@ -41,7 +41,7 @@ class LogQuality(NamedTuple):
 class AccountedLog(DecodedLog):
     """The messages of a session, and which of them are missing.
 
-    `Log`, which users open, describes the arguments and attributes.
+    See `Log`, the public class, for the arguments and attributes.
     """
 
     @cached_property
@@ -50,8 +50,8 @@ class AccountedLog(DecodedLog):
 
         A recorder that crashes leaves an unfinished file. A log of several files is complete if
         all of them were finished. It is also complete if the last file was finished and no
-        record is missing, since another recorder may have recorded what an unfinished file
-        lacks.
+        record is missing, since another recorder may have recorded the messages that an
+        unfinished file lacks.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
@@ -77,9 +77,9 @@ class AccountedLog(DecodedLog):
     def executed_sites(self) -> tuple[str, ...]:
         """Names of the sites whose records can be recomputed from this file.
 
-        These are all sites, except in an open-loop rerun, where some sites are not executed.
-        The records of those sites are copied from the original log and depend on samples that
-        this file does not contain.
+        These are all sites, except in an open-loop rerun, which repeats only some of the sites.
+        The records of the other sites are copied from the original log and depend on samples
+        that this file does not contain.
         """
         executed = self.session.get(EXECUTED_SITES_KEY)
         if self.driver != RERUN_DRIVER or executed is None:
@@ -93,8 +93,8 @@ class AccountedLog(DecodedLog):
         The recorder writes these lines when it finishes a file, so the mapping is empty for an
         unfinished file. If the log consists of several files, no single file states the totals,
         so the records, statistics and events of all files are counted again. Counts without a
-        topic, such as that of dropped messages, cannot be recomputed. `LogContents.of_session`
-        has added up these counts of all files.
+        topic, such as the number of dropped messages, cannot be recomputed. They are added up
+        over all files by `LogContents.of_session`.
         """
         written_counts = self._contents.metadata.get(ACCOUNTS, {})
         has_one_file = len(self.sources) == 1
@@ -148,8 +148,8 @@ class AccountedLog(DecodedLog):
             sequence: Tick of each message, in file order.
 
         Returns:
-            The account of the channel. None if the channel is not numbered consecutively: only
-                the records and the link statistics of a site are.
+            The account of the channel. None unless the channel contains the records or the link
+                statistics of a site of this session, whose sequence numbers are ticks.
         """
         key = topics.parse_key(topic.removeprefix("/"))
         if (
@@ -201,9 +201,9 @@ class AccountedLog(DecodedLog):
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Maps each site that joined while the session was running to the list of its starts.
+        """Lists the starts of each site that joined after the session had begun.
 
-        A start is a pair of its first tick and the random number (boot) that identifies this
+        Each start is given by its first tick and the random number (boot) that identifies this
         start of the process. Sites that were present from the beginning and never restarted
         have no entry.
         """
@@ -217,7 +217,7 @@ class AccountedLog(DecodedLog):
 
     @cached_property
     def absences(self) -> dict[str, list[tuple[int, int]]]:
-        """Ticks that a site did not execute because its process was not running.
+        """Ranges of ticks that each site did not execute because its process was not running.
 
         This happens when a process is killed and restarted, or joins a session late. Each start
         in `starts` is preceded by a range (first tick, last tick) of such ticks. The range
@@ -299,7 +299,7 @@ class AccountedLog(DecodedLog):
     def absent_ticks(self, site: str) -> int:
         """Counts the ticks that a site did not execute during the session.
 
-        The process may have started late or ended early, see `find_unexecuted_ticks`.
+        These are the ticks in the ranges that `find_unexecuted_ticks` returns.
 
         Args:
             site: Name of the site.

@@ -87,8 +87,8 @@ class RangeSet:
     def remove(self, number: int, last_to_remove: int | None = None) -> bool:
         """Removes a number, or all numbers from `number` to `last_to_remove`.
 
-        All numbers to remove must lie within a single range of the set. Zero, one or two ranges
-        remain of it.
+        All numbers to remove must lie within a single range of the set. Up to two smaller
+        ranges remain in its place.
 
         Args:
             number: The number to remove, or the first of several.
@@ -166,7 +166,8 @@ class Account:
         unpublished: Number of messages that were never published, because the sender skipped
             them, or was killed before it reached them and continued after them when restarted.
         last: Highest message number known to exist; -1 before the first message.
-        silence_ns: Longest time between two arrivals, in ns; 0 without arrival times.
+        silence_ns: Longest time between two consecutive arrivals, in ns; 0 if no arrival times
+            are known.
     """
 
     def __init__(self) -> None:
@@ -293,9 +294,9 @@ class Account:
         return lowest_unpublished
 
     def mark_missing(self, first: int, last: int) -> None:
-        """Reclassifies numbers that had counted as unpublished as missing.
+        """Reclassifies a range of unpublished numbers as missing.
 
-        Needed when another site reports that messages with these numbers existed.
+        Needed when another site reports that messages with these numbers were published.
 
         Args:
             first: First number of the range.
@@ -305,9 +306,9 @@ class Account:
         self.unpublished -= last + 1 - first
 
     def abandon_below(self, number: int) -> None:
-        """Gives up on missing messages below a number, which no process can resend.
+        """Gives up on the missing messages below a number, because no process can resend them.
 
-        They are no longer requested but still count as missing. If such a message arrives after
+        They are no longer requested but still count as missing. If one of them arrives after
         all, it counts as received.
 
         Args:
@@ -367,9 +368,9 @@ class Account:
         missing numbers. `parse_counts` can read it back.
 
         Args:
-            *before: Accounts of earlier starts of the sender, each numbered from 0. Their
-                counts are added to those of this account. Missing ranges are listed for the
-                last start only.
+            *before: Accounts of earlier starts of the sender, each of which numbered its
+                messages from 0. Their counts are added to those of this account. Missing ranges
+                are listed for the last start only.
         """
         starts = (*before, self)
         counts = []
@@ -562,8 +563,8 @@ class Coverage(NamedTuple):
     def share(self) -> float:
         """Fraction of ticks that were recorded or checked at the worst site, from 0 to 1.
 
-        A run is only as well known as its worst site. The fraction is 0 if no site has any
-        ticks, but one site with no ticks does not lower it.
+        The smallest fraction among the sites counts. It is 0 if no site has any ticks, but a
+        single site without ticks does not lower it.
         """
         if not any(self.expected.values()):
             return 0.0
@@ -621,10 +622,10 @@ peer was restarted.
 
 
 def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns how many ticks an arm missed just before a record.
+    """Returns how many ticks a site skipped just before a record.
 
-    Ticks are missed if the control loop is too late. A record contains the changes applied in
-    its tick, including those that report missed ticks.
+    A site skips ticks when its control loop falls behind. A record contains the changes applied
+    in its tick, including those that report skipped ticks.
 
     Args:
         texts: Changes in the record, as JSON strings. Invalid strings are ignored.

@@ -215,7 +215,7 @@ class ContentCheck:
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
-        """Returns the description of a channel as a correct log of the session contains it.
+        """Returns the description that a channel has in an undamaged log of the session.
 
         A recovery uses it to restore a description that was lost.
 
@@ -237,10 +237,10 @@ class ContentCheck:
         payload: bytes,
         span_ns: tuple[int, int],
     ) -> None:
-        """Raises UnreadableRecord unless a message is provably the next of its channel.
+        """Raises UnreadableRecord unless a message is provably the next one in its channel.
 
         Used for messages that no checksum covers. A message that passes is stored for later
-        comparison, as `accept` does.
+        comparison, as by `accept`.
 
         Args:
             topic: Topic of the channel.

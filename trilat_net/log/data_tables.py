@@ -184,7 +184,7 @@ class Table:
     def label(self) -> str:
         """Name of the table for file names, such as "m1_link" for the links of site "m1".
 
-        The name of a table about all sites contains no site, for example "events".
+        The label of a table that covers all sites, such as "events", does not name a site.
         """
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
@@ -381,8 +381,8 @@ class Table:
     def of_events(cls, timed: TimedMessages[Event], source: str) -> "Table":
         """Creates a table of the events of a session, with one row per event.
 
-        An event is a message about something that happened once, for example that a site
-        joined. Rows are in the order in which the events arrived at the recorder.
+        An event is a message that reports an occurrence, such as a site joining the session.
+        Rows are in the order in which the events arrived at the recorder.
 
         Args:
             timed: The events, with their sending and arrival times.

@@ -28,7 +28,7 @@ M = TypeVar("M", Event, LinkStats, RecorderStats)
 class DecodedLog(Mapping[str, SiteLog]):
     """The messages of a session: a mapping from the name of each site to its records.
 
-    `Log`, which users open, describes the arguments and attributes.
+    See `Log`, the public class, for the arguments and attributes.
     """
 
     def __init__(self, contents: LogContents) -> None:

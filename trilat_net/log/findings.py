@@ -119,7 +119,7 @@ class Findings(dict[str, Finding]):
     """Mapping from the name of a check of a log to its result, in order of first use.
 
     Reading a name that does not exist yet creates a result with no problems, so any code can
-    add a problem with `findings["records"]`.
+    add a problem with `findings["records"].add(...)`.
     """
 
     def __missing__(self, check: str) -> Finding:
@@ -129,7 +129,7 @@ class Findings(dict[str, Finding]):
 
 @dataclass(frozen=True, repr=False)
 class CheckReport(Result):
-    """Results of several checks on a log, and the base class for results of such commands.
+    """Results of several checks on a log. Base class for results that include such checks.
 
     Derives from the individual findings whether the log passed, and the exit code of the
     command.

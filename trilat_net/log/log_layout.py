@@ -182,7 +182,7 @@ CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
 }
 """Maps each channel to the type of its messages."""
 EXECUTED_SITES_KEY = "rerun_executed"
-"""Key of the session metadata that lists the sites executed in a rerun. The records of the
+"""Key of the session metadata that lists the sites that a rerun repeated. The records of the
 other sites are copied from the original log.
 """
 RERUN_DRIVER = "rerun"

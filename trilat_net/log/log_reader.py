@@ -63,7 +63,7 @@ class Log(Result, AccountedLog):
         scenario_text: Text of the scenario, as stored in the file.
         scenario_sha256: SHA-256 hash of that text.
         sites: Names of the sites, in scenario order.
-        events: Events of all members, grouped by member, in numerical order.
+        events: Events of all members, grouped by member, in the order of their numbers.
         damaged: One sentence for each part of the file that cannot be read.
         chain: Result of comparing the contents with the digests stored in the file. For several
             files, the worst result.
@@ -303,10 +303,9 @@ class Log(Result, AccountedLog):
         ]
 
     def warn_of_failures(self) -> None:
-        """Issues a Python warning if an arm exceeded its limits or a user's program failed.
+        """Issues Python warnings if an arm diverged, or if a program that moves an arm failed.
 
-        The program is one that moves an arm. The warning points to the line that called the
-        caller of this method.
+        The warnings point to the line that called the caller of this method.
         """
         for failure in self.failed_hands:
             warnings.warn(failure, RuntimeWarning, stacklevel=3)
@@ -343,7 +342,7 @@ class Log(Result, AccountedLog):
         return shown_ticks
 
     def sample_ages_ns(self, peer: str, site: str) -> Ints:
-        """Computes how old the peer's sample was that a site used in each tick, in ns.
+        """Computes the age of the peer's sample that a site used in each tick, in ns.
 
         The age exceeds the network delay if the next sample is late or lost.
 
@@ -352,7 +351,7 @@ class Log(Result, AccountedLog):
             site: Name of the site that used them.
 
         Returns:
-            The ages, in ns. Ticks before the first sample came into use are left out.
+            The ages, in ns. Ticks before the site used its first sample are left out.
         """
         ages_ns = self[site].age_ns(peer, self.scenario.sites[peer].rate_hz)
         return ages_ns[self[site].used[peer] >= 0]
@@ -450,8 +449,8 @@ def open_log(
         more: Further parts of the session, in any order.
         progress: Function that is called repeatedly with the number of bytes read and the
             total.
-        law: Files of control laws that the log names and that may run when the log is executed,
-            see docs/sessions/code-that-runs.md. Laws that this process has already run need no
+        law: Files of control laws that the log names and that are permitted to run, see
+            docs/sessions/code-that-runs.md. Laws that this process has already run need no
             permission.
         other_version: True to accept files whose hashes differ from those in the log.
         remember: True to permit these laws for other logs too, if they name the same hashes and

@@ -299,8 +299,8 @@ class FileCheck:
     def finish(self) -> None:
         """Reports the damaged parts of the file, and compares its end with the data.
 
-        The end holds an index and statistics. It is compared only if the file was finished and
-        has no damaged part, since otherwise everything would differ.
+        The end holds an index and statistics. They are compared only if the file was finished
+        and has no damaged part, since otherwise they would differ from the data anyway.
         """
         scanner = self._scanner
         if not scanner.begins:

@@ -125,7 +125,7 @@ class RotationVectors:
         return columns.reshape(*shape, len(MATRIX_ENTRIES))
 
     def nearest_to(self, references: Array) -> Array:
-        """Adds whole turns to each rotation vector to bring it closest to a reference.
+        """Adds whole turns to each rotation vector to minimise its distance from a reference.
 
         The results may be longer than half a turn.
 
@@ -149,7 +149,7 @@ class RotationVectors:
         """Unwraps the rotation vectors, so that they stay continuous at half a turn.
 
         The unwrapped vectors represent the same rotations. They can be up to a full turn long,
-        and are discontinuous only there. The rotation vectors must be in chronological order.
+        and jump only at a full turn. The rotation vectors must be in chronological order.
 
         Returns:
             The unwrapped rotation vectors, shape (K, 3), in rad.
@@ -207,8 +207,8 @@ def _to_rotation_vectors(w: Array, v: Array) -> Array:
 def expand_poses(x: Array) -> Array:
     """Replaces the rotation vector of each pose by two columns of its rotation matrix.
 
-    Training environments observe poses in this format, and `HandView` passes the same numbers
-    to a user's operator class:
+    The observations of training environments contain poses in this format, and `HandView`
+    passes the same numbers to a user's operator class:
 
     >>> import numpy as np
     >>> quarter_turn = np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])

@@ -171,7 +171,7 @@ class RecordColumns:
         counts = np.zeros(len(self._payloads), dtype=np.int64)
 
         def iterate_numbers() -> Iterator[int]:
-            """Yields three integers per arrival, and stores the arrivals of each record."""
+            """Yields three integers per arrival, and counts the arrivals of each record."""
             for row, arrivals in enumerate(self._decode_fields("rx")):
                 counts[row] = len(arrivals)
                 for entry in arrivals:

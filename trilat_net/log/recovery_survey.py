@@ -325,9 +325,9 @@ class RecoverySurvey:
         def is_genuine(definition: Definition) -> bool:
             """Returns True if a definition may belong to the session of the messages.
 
-            This holds for all definitions with a valid checksum. Any other definition is
-            foreign if it names the rejected session and either lies in a page with foreign data
-            or the session was renamed.
+            This holds for all definitions that are covered by a checksum. Any other definition
+            is foreign if it names the rejected session, and if in addition it lies in a page
+            with foreign metadata or the messages belong to a session of another name.
             """
             offset = self._uncovered_offsets.get(definition)
             if offset is None:  # a checksum covers the definition

@@ -101,8 +101,8 @@ class IndexedRecords:
     def boots(self) -> Ints:
         """Random number in each record that identifies the start of the process, shape (K,).
 
-        A restarted process has another number. It is an unsigned 64-bit integer, returned as
-        the signed integer with the same bits.
+        A restarted process has a different number. It is an unsigned 64-bit integer, returned
+        as the signed integer with the same bits.
         """
         return self._heads[:, _BOOT]
 

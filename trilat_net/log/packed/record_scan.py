@@ -431,9 +431,8 @@ def gather_ints(data: Bytes, starts: Ints, marks: Any, gaps: Ints, numbers: Ints
     Args:
         data: The encoded records, followed by padding.
         starts: Offset of the first byte of each of the K records, shape (K,).
-        marks: Offset at which the search for the integers begins, from the start of each
-            record, shape (K,).
-        gaps: Number of other bytes before each of the N integers, shape (N,).
+        marks: Offset at which the first gap begins, from the start of each record, shape (K,).
+        gaps: Number of other bytes just before each of the N integers, shape (N,).
         numbers: Output array for the integers, shape (K, N).
     """
     for k in range(starts.shape[0]):

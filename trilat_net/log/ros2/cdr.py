@@ -333,7 +333,7 @@ def pack_trigger_response(*, success: bool, text: str) -> bytes:
 
 
 class Diagnosis(NamedTuple):
-    """Status of one component, as reported in the ROS topic `/diagnostics`.
+    """Status of one component, as reported on the ROS topic `/diagnostics`.
 
     Robot monitors display these statuses, with one colour per level.
 

@@ -461,9 +461,9 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
 
     The curves are the joint positions q, their references q_des, the velocities qd, the torques
     tau, the error e = q - q_des, the exogenous torque tau_x, the estimated parameters
-    theta_hat, the vectors that the control law sends, and the mode. If the sites share the pose
-    x of the end effector instead, the joints have no reference. In that case q is repeated in
-    place of q_des, and e is x - x_des.
+    theta_hat, the vectors that the control law sends, and the mode. If the sites share the
+    poses x of their end effectors instead of joint positions, the joints have no reference. In
+    that case q is repeated in place of q_des, and e is x - x_des.
 
     Args:
         records: The records, at least one.
