@@ -40,8 +40,9 @@ _EVENTS_NUMBERED_SINCE = 3
 class SessionAccounts:
     """Counts the received and missing messages of all numbered channels of a session.
 
-    Used by a recorder while it records, and later by the check of a log. The caller passes
-    every message. From the events, the class determines how many ticks each site executed.
+    Used by a recorder while it records, and later by the check of a log. The caller reports
+    every message to this object, which determines from the events how many ticks each site
+    executed.
 
     Args:
         session: Name of the session.
@@ -177,8 +178,8 @@ class SessionAccounts:
         - "join": first tick of a sender that joins the running session. An impossible tick is
           ignored, because it would leave a gap up to that tick.
         - `_OVERRUN`: ticks that the sender skipped because it was late.
-        - `LAST`: number of ticks of another site that the sender received before that site was
-          restarted.
+        - `LAST`: number of ticks of another site whose samples the sender had received before
+          that site was restarted.
 
         Other events are ignored, as are events of members that are not sites.
 
@@ -460,11 +461,11 @@ class SessionAccounts:
     def open(
         cls, metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
     ) -> "SessionAccounts | None":
-        """Prepares to count a session's messages, before a file of it is read.
+        """Prepares to count the messages of a session, before a file of its log is read.
 
         Args:
-            metadata: Maps the name of each metadata record of the file to its contents. They
-                identify the session.
+            metadata: Maps the name of each metadata record of the file to its contents. These
+                records identify the session.
             attachments: Maps the name of each attachment of the file to its contents. One of
                 them is the scenario.
 

@@ -94,7 +94,7 @@ class LogCheckResult(CheckReport):
         """Returns the results of all checks as plain values for JSON, with one row per check.
 
         A row contains the name of the check, whether it passed, and its problems with their
-        places.
+        positions in the files.
         """
         return [
             {
@@ -138,7 +138,8 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
             total.
 
     Raises:
-        LogError: A file cannot be read, or belongs to another session than the previous files.
+        LogError: A file cannot be read, or does not belong to the session of the previous
+            files.
     """
     check = _SessionCheck()
     paths = [Path(file) for file in files]
@@ -464,7 +465,7 @@ class _SessionCheck:
                 total.
 
         Raises:
-            LogError: The file belongs to another session than the previous files.
+            LogError: The file does not belong to the session of the previous files.
         """
         reader = McapReader(stream, file, progress, kept=False)
         structure = FileCheck(file, reader.scanner, self._findings)
@@ -482,7 +483,7 @@ class _SessionCheck:
             structure: Check of the file's bytes.
 
         Raises:
-            LogError: The file belongs to another session than the previous files.
+            LogError: The file does not belong to the session of the previous files.
         """
         checks: dict[str, _ChannelCheck | None] = {}
         self._file = file
@@ -532,8 +533,7 @@ class _SessionCheck:
             reader: Reader of the file.
 
         Raises:
-            LogError: The file belongs to another session than the previous files, or to no
-                session.
+            LogError: The file does not belong to the session of the previous files.
         """
         about = reader.metadata.get(SESSION, {})
         has_metadata = {"session", "driver"} <= about.keys()

@@ -476,7 +476,7 @@ class SiteLog:
             ) from None
 
     def record(self, n: int) -> State:
-        """Decodes a single record of an arm without the others, which is fast for a long log.
+        """Decodes a single record without decoding the others, which is fast for a long log.
 
         Args:
             n: Index of the record in tick order. -1 is the last record.
@@ -519,8 +519,8 @@ class SiteLog:
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
         """Mapping from ticks to records.
 
-        Used to compare two logs, because either may lack records. If several records have the
-        same tick, the last one counts.
+        Used to compare two logs tick by tick, because either log may lack records. If several
+        records have the same tick, the last one counts.
         """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
@@ -702,9 +702,9 @@ class SiteLog:
         """Synchronisation error q - q_des, Eq. (9), shape (K, n), in rad.
 
         In task space, the error is x - x_des, shape (K, m), in m. For orientations, the error
-        is the rotation vector from the reference to the end effector, in rad, at most half a
-        turn long. The control law uses the same vector, which jumps where it passes half a
-        turn.
+        is the rotation vector from the reference to the end effector, in rad, with an angle of
+        at most half a turn. The control law uses the same vector, which jumps where the angle
+        passes half a turn.
         """
         if self.layout.task:
             return compute_task_errors(self.x, self.q_des, self.axes)
@@ -736,7 +736,7 @@ class SiteLog:
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Tick of the sample of each peer that the control law used in each record.
+        """Tick of the sample of each peer that the control law used in the tick of each record.
 
         Maps the name of each peer to an array of shape (K,). The tick is -1 before the first
         sample of the peer.
@@ -780,7 +780,7 @@ class SiteLog:
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_ns(self, peer: str, rate_hz: int) -> Ints:
-        """Computes the age of the sample that the control law used in each record, in ns.
+        """Computes the age of the peer's sample that the control law used in each tick, in ns.
 
         The age is the time of the record minus the stamp of the sample. The stamp is the
         nominal time of the tick in which the peer computed the sample.
@@ -797,7 +797,7 @@ class SiteLog:
         return self.t_ns - stamps_ns
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Computes the age of the peer's sample that the control law used in each record, in s.
+        """Computes the age of the peer's sample that the control law used in each tick, in s.
 
         `age_ns` defines the age.
 

@@ -51,12 +51,12 @@ InnerRecord = tuple[int, bytes]
 class TornChunk(NamedTuple):
     """A compressed chunk of messages whose end is missing from its file.
 
-    This happens when a recording is interrupted. The messages in the part that exists can still
+    This happens when a recording is interrupted. The messages in the remaining part can still
     be recovered.
 
     Attributes:
         head: Header of the chunk, which describes the compressed records.
-        packed: Compressed bytes of the chunk that exist and can be trusted.
+        packed: Compressed bytes of the chunk that are in the file and can be trusted.
         offset: Offset of the first compressed byte in the file.
     """
 
@@ -66,7 +66,7 @@ class TornChunk(NamedTuple):
 
     @classmethod
     def read(cls, scanner: RecordScanner, offset: int) -> "TornChunk":
-        """Reads the existing part of a truncated chunk.
+        """Reads the remaining part of a truncated chunk.
 
         Args:
             scanner: Scanner of the file.

@@ -75,7 +75,7 @@ class _UnwrittenSiteLog(SiteLog):
 
 
 class UnwrittenLog(Log):
-    """Log of a simulated run that was completed in memory, without messages.
+    """Log of a completed simulation, whose records are arrays in memory and not messages.
 
     Args:
         scenario: Scenario of the run.

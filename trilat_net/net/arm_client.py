@@ -349,7 +349,8 @@ class _OutsideClient(SiteClient):
         """Connects a program to a site over the network.
 
         Args:
-            session: Name of the session, by default the name of the scenario.
+            session: Name of the session. Unless the session was given a name, this is the name
+                of its scenario.
             site: Name of the site.
             connect: Endpoints of the site, which the site prints while it waits for its arm.
             keys: Folder with the keys of one member, as created by `trilat keys new`. An arm's
@@ -447,9 +448,9 @@ class ArmClient(_OutsideClient):
 
         - before the first tick and after the end of the run,
         - if the newest record is older than `FRESH_NS`,
-        - `_BRAKE_NS` after a fault or after the release of the dead-man switch. Until then, the
-          torque brings the arm to rest. If the arm had already been stopped by a command when
-          the switch was released, this time is measured from the stop.
+        - once `_BRAKE_NS` have passed since a fault or the release of the dead-man switch.
+          Before that, the torque brings the arm to rest. If the arm had already been stopped by
+          a command when the switch was released, this time is measured from the stop.
         """
         record = self.record
         if record is None or not self.fresh:

@@ -91,7 +91,7 @@ class SystemClock:
 
     @classmethod
     def with_error(cls, offset_s: float, drift_ppm: float) -> Clock:
-        """Returns the system clock, or one with an offset and a drift from it for tests.
+        """Returns the system clock, or a test clock with an offset and a drift relative to it.
 
         Args:
             offset_s: Offset from the system clock, in s.

@@ -97,12 +97,12 @@ class Connection:
 
     @property
     def listen_addresses(self) -> list[str]:
-        """Addresses on which the process listens, as strings. Encrypted if there are keys."""
+        """Addresses on which the process listens, as strings. With keys, TLS replaces TCP."""
         return find_endpoint_addresses(self.reach(self.listen))
 
     @property
     def connect_addresses(self) -> list[str]:
-        """Addresses to which the process connects, as strings. Encrypted if there are keys.
+        """Addresses to which the process connects, as strings. With keys, TLS replaces TCP.
 
         Empty if the endpoints are not known yet.
         """
@@ -110,9 +110,9 @@ class Connection:
 
     @property
     def unprotected_addresses(self) -> list[str]:
-        """Addresses that are neither encrypted nor limited to this machine.
+        """Addresses whose connections are neither encrypted nor limited to this machine.
 
-        Anybody on the network of such an address can read the messages and take part.
+        Anybody on the network of one of these addresses can read the messages and take part.
         """
         return [
             address

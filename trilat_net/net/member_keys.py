@@ -99,7 +99,7 @@ class MemberKeys(NamedTuple):
     hosts: tuple[str, ...] = ()
 
     def list_risks(self) -> Iterator[str]:
-        """Yields who else could use the keys on this machine, and the remedy for each risk."""
+        """Yields a warning for each risk to the keys on this machine, with its remedy."""
         if read_foreign_permissions(self.folder):
             yield f"other users can read {self.folder}; run: chmod 700 {self.folder}"
 

@@ -172,7 +172,7 @@ class EventPublisher:
 
 
 class LateSites(NamedTuple):
-    """Specifies whether a site may join a running session, and which sites a start waits for.
+    """Says whether a site may join a running session, and which sites may miss the start.
 
     Attributes:
         may_join_late: True if this site may join a running session. Set it only if every site
@@ -314,8 +314,8 @@ class Membership:
 
         Every running site states the members that it has admitted and their boots. Two sites
         agree if they state the same boots. The boot of this member is ignored in the
-        comparison, because it may already have been admitted by some sites and not yet by
-        others.
+        comparison, because some sites may have admitted this member already, and others not
+        yet.
 
         Returns:
             The identities of the sites that agree with the first running site, sorted by name.
@@ -340,8 +340,8 @@ class Membership:
 
         Args:
             may_have_started: True if this member has announced that it is ready. The session
-                may then start before this member is informed, so it does not give up if a site
-                is already running.
+                may then start before this member is informed, so the member does not give up if
+                a site is already running.
 
         Raises:
             SessionError: This member cannot be part of the session.

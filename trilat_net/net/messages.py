@@ -176,8 +176,8 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         The result can be compared with a repeated execution of the tick. Most fields are the
         same in both forms and are explained in `TickRecord`. Three fields differ:
 
-        - The mode is a word in the log. An unknown word, as in the log of another version,
-          becomes "diverged".
+        - The mode is a word in the log. An unknown word, as in a log from another version of
+          the program, becomes "diverged".
         - `used` (the tick of the newest sample in use) is listed in the log by the name of the
           peer, and in the object by the index of the peer. -1 means that there is no sample.
         - `mem` (the memory of the site) is empty unless it is complete.

@@ -116,9 +116,9 @@ def answer_pings(
     """
 
     def answer(_: bytes) -> bytes:
-        """Returns the reply to a ping, with clock readings from its arrival and departure.
+        """Returns the reply to a ping, with the times of the ping's arrival and of the reply.
 
-        The sender subtracts the time between the two readings from the measured round trip.
+        The sender subtracts the time between the two from the measured round trip.
         """
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()

@@ -80,8 +80,8 @@ class ChangeRequest(DirectMessage, frozen=True, kw_only=True):
         mark: Text stored in the log to mark the present moment.
         order: Command to the site, such as "stop", executed in its next tick.
         source: The person or program that requests the change: a noun phrase such as "the
-            experimenter", which is repeated in the site's event. A request without a source is
-            encoded as the same bytes as a request from a program that does not know this field.
+            experimenter", which is repeated in the site's event. Without a source, the
+            encoded request is identical to that of a program that does not know this field.
     """
 
     link: str = ""

@@ -132,7 +132,7 @@ class SessionMembers:
         """Queries the members of a session, and yields their identities as they arrive.
 
         The query is repeated until the search ends, because a reply may be lost. The same
-        identity is therefore yielded repeatedly. Replies to earlier queries do not count.
+        identity is therefore yielded repeatedly. Replies to earlier queries are ignored.
 
         Args:
             stopped: Function that returns True to end the search.
@@ -230,7 +230,7 @@ class SessionMembers:
                 published = backfill.made
 
     def require_absent(self, stopped: Callable[[], bool]) -> None:
-        """Raises SessionError if a member is present under the session name of a playback.
+        """Raises SessionError if a session already exists under the name chosen for a playback.
 
         Args:
             stopped: Function that returns True to end the check early.

@@ -40,7 +40,7 @@ class SiteStandIn:
         scenario_text: TOML text of the scenario.
 
     Attributes:
-        boot: The argument.
+        boot: Random number that identifies the start of the site's process.
     """
 
     def __init__(

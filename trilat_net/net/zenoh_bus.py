@@ -414,7 +414,7 @@ class ZenohBus:
 
         An entry consists of the key of a member's liveliness token and a flag, which is True if
         the token has appeared and False if it has disappeared. Tokens that already exist are
-        reported first. The tokens of this session are left out.
+        reported first. The tokens of this connection are left out.
 
         Args:
             key: Key of the tokens, which may contain wildcards.

@@ -226,7 +226,7 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     def equals_session_value(mode: str, value: Any) -> bool:
         """Returns True if a user's value for one Zenoh mode is the one that a session uses.
 
-        The types must be equal too. False for a mode in which a session sets no value.
+        The types must be equal too. False for a mode for which a session sets no value.
         """
         if mode not in session_values:
             return False
@@ -355,7 +355,7 @@ class ZenohFile:
 
         Raises:
             UsageError: The file is not a Zenoh configuration, or contradicts the requirements
-                of a session. The message lists all contradicting keys.
+                of a session. The message lists all offending keys.
         """
         if not isinstance(stated, dict):
             raise UsageError(

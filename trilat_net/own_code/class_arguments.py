@@ -30,8 +30,8 @@ def make_own_instance(
     """Creates an instance of a user's class, after checking its arguments.
 
     A wrong argument is reported with its path in the scenario, like any other wrong key, and
-    not as an exception within the class. A class without a constructor receives neither the
-    facts nor the settings.
+    not as an exception within the class. A class without a constructor is created without any
+    arguments.
 
     Args:
         kind: The class.
@@ -147,7 +147,7 @@ def _check_type(parameter: inspect.Parameter, value: Any, subject: str, path: st
 
 
 def list_default_arguments(content: bytes, name: str) -> dict[str, Any]:
-    """Returns the default values of a user's class's arguments, without running its file.
+    """Returns the default values of the arguments of a user's class, without running its file.
 
     A default that is not a literal is returned as its Python source text.
 

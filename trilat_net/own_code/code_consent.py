@@ -159,9 +159,10 @@ def allow_logged_code(
         remember: True to store the permission for later logs.
 
     Raises:
-        UsageError: A file does not define code that the log names, or is another version of it.
-            Also raised if an option requires a file and none is named.
-        ScenarioError: A file cannot be read, or does not define such a class. No code has run.
+        UsageError: A file does not belong to code that the log names, or is not the version
+            that ran. Also raised if an option requires a file and none is named.
+        ScenarioError: A file cannot be read, or does not define the class that the log names.
+            No code has run.
     """
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
     if (other_version or remember) and not files:
@@ -323,7 +324,7 @@ class LoggedUserLaw(NamedTuple):
 
     @classmethod
     def inspect(cls, law: ImportedLaw, sites: tuple[str, ...]) -> "LoggedUserLaw":
-        """Finds the file of a user's control law, and whether the law may run.
+        """Finds the file of a user's control law, and determines whether the law may run.
 
         None of its code is run.
 

@@ -108,7 +108,7 @@ class _SiteWithCode(Protocol):
 
     @property
     def hands(self) -> Sequence[Any]:
-        """Persons and programs who move the arm. A program may be a user-written class."""
+        """People and programs that move the arm. A program may be a user-written class."""
 
     @property
     def plant(self) -> Any:
@@ -137,8 +137,8 @@ arguments itself.
 class CodeKey(NamedTuple):
     """Identifies user-written code by its class, the hash of its file and its arguments.
 
-    A person permits code to run under this key. If the file or an argument changes, the
-    permission no longer applies.
+    A person's permission to run the code is stored under this key. If the file or an argument
+    changes, the permission no longer applies.
 
     Attributes:
         code: Module and class, for example "package.module:Law".
@@ -152,7 +152,7 @@ class CodeKey(NamedTuple):
 
     @classmethod
     def of(cls, named: NamedCode) -> "CodeKey":
-        """Returns the key under which a user's class may be permitted to run.
+        """Returns the key under which the permission to run a user's class is stored.
 
         The key consists of the class, the hash of its file and its arguments.
 
@@ -216,9 +216,9 @@ class CodeKey(NamedTuple):
 
         Raises:
             CodeWithheld: There is no permission.
-            ScenarioError: The file differs from the permitted one, or does not define such a
-                class, in which case none of its code has run. Also raised if the code raises an
-                error while it is imported.
+            ScenarioError: The file differs from the permitted one, or does not define the class
+                or its method, in which case none of its code has run. Also raised if the code
+                raises an error while it is imported.
         """
         code = self.code
         module, _, name = code.partition(":")

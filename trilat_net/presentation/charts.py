@@ -85,10 +85,10 @@ class ChartBuilder:
     Attributes:
         bounds_m: Left, right, bottom and top of the bounding box of the motion of all arms, in
             m.
-        units_per_m: Scale of the pictures of the arms, in picture units per m. Pictures that
-            contain a chain, or planar arms that move within less than half of `PICTURE_SIDE`,
-            are scaled up to that size because line widths are fixed. All other pictures have
-            scale 1.
+        units_per_m: Scale of the pictures of the arms, in picture units per m. It is 1 if all
+            arms are planar and the longer side of the bounding box is at least half of
+            `PICTURE_SIDE`. Otherwise, the longer side is scaled to `PICTURE_SIDE`, because line
+            widths are fixed.
         leads: Weights with which each slave follows the other arms over time.
     """
 

@@ -291,7 +291,8 @@ def conclude_files(
 ) -> tuple[Log, Conclusion]:
     """Checks a newly recorded log, writes its report, and prints the result.
 
-    If the user interrupts this, a note shows the command that writes the report later.
+    If the user interrupts the checks or the drawing, a note shows the command that writes the
+    report later.
 
     Args:
         paths: Files of the log.

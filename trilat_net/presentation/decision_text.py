@@ -67,8 +67,8 @@ def describe_tick_span(
 
     Args:
         span_s: The time span, in s. None if all ticks are alike.
-        deviation_per_s: Uncertainty of the rate caused by delays that do not repeat exactly, in
-            1/s. None if they nearly repeat.
+        deviation_per_s: Uncertainty of the rate caused by delays that do not repeat, in 1/s.
+            None if the delays repeat exactly or nearly.
         repeats: True if the delays repeat after this span.
 
     Returns:
@@ -84,7 +84,7 @@ def describe_tick_span(
 
 
 def describe_left_out(roots: stability_decision.LoopRoots) -> str:
-    """Returns a phrase about programs whose reaction the linear analysis ignores.
+    """Returns a phrase about programs whose reaction to the arms the linear analysis ignores.
 
     A program that moves an arm can run arbitrary code, which cannot be linearised. The phrase
     is empty if there is no such program.

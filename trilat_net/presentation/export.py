@@ -43,7 +43,7 @@ class ExportFormat(NamedTuple):
         ending: Suffix of the default output path, which is appended to the name of the log.
         folder: True if the format writes a folder.
         extra: Group of optional packages that the format needs. `None` if it needs none.
-        module: Module of the group that the format imports.
+        module: Module that the format imports from this group.
         many: True if the format accepts several logs.
     """
 

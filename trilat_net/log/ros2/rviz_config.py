@@ -33,7 +33,8 @@ _SUFFIX = ".rviz"
 def write_rviz_config(log: Path, *, force: bool = False) -> Path:
     """Writes a configuration for RViz, the 3D viewer of ROS 2, that shows the arms of a log.
 
-    RViz shows a log while its session runs over ROS, and a bag while it is played back.
+    RViz shows the arms while the live bridge publishes the session, or while the bag is played
+    back.
 
     Args:
         log: Path of the log or bag.
@@ -43,7 +44,7 @@ def write_rviz_config(log: Path, *, force: bool = False) -> Path:
         The path of the configuration, which is next to the log.
 
     Raises:
-        UsageError: The bag contains no description of an arm, or the configuration exists.
+        UsageError: No topic contains the description of an arm, or the configuration exists.
         LogError: The log cannot be read.
     """
     path = log.with_suffix(_SUFFIX)
@@ -63,7 +64,7 @@ def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
         topics: Maps the full name of each topic, which begins with "/", to its description.
 
     Raises:
-        UsageError: The topics describe no arm.
+        UsageError: No topic contains the description of an arm.
     """
     displays = ""
     arm_count = 0

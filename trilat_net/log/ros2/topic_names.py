@@ -66,7 +66,7 @@ DIAGNOSTICS = "diagnostics"
 
 
 class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings of a real robot that serves as the arm of a site, from the user's file of names.
+    """Settings of a real robot that serves as a site's arm, from the file with the ROS 2 names.
 
     Attributes:
         joints: Names of the joints in the robot's messages, in scenario order. If empty, the
@@ -87,8 +87,8 @@ class TopicTable(NamedTuple):
 
     Attributes:
         names: Maps the trilat-net name of each topic to its ROS 2 name.
-        of_site: For each site that differs, maps the trilat-net name of a topic to its ROS 2
-            name.
+        of_site: For each site with names of its own, maps the trilat-net name of a topic to its
+            ROS 2 name.
         robots: Maps the names of sites with a real robot to the settings of the robot.
     """
 

@@ -86,7 +86,7 @@ class _BucketOutput:
     def flush(self, log_ns: int) -> None:
         """Writes the second message of a time interval, if it is still pending.
 
-        `add` has kept its curve values back, so that messages are evenly spaced in time.
+        `add` kept this message back, so that messages are evenly spaced in time.
 
         Args:
             log_ns: Arrival time to store in the log with the message, in Unix time, in ns.
@@ -245,7 +245,7 @@ class _SiteBuckets:
         self._put(topic, data, stamp_ns, log_ns)
 
     def add_record(self, record: Record, log_ns: int) -> None:
-        """Adds a record of the site, and writes the messages that are then complete.
+        """Adds a record of the site, and writes the messages that the record completes.
 
         Records are collected in buckets, intervals of equal length. A bucket becomes two
         messages with the minimum and the maximum of each curve. To space the messages evenly,
@@ -457,8 +457,8 @@ class VizChannels:
 
     Attributes:
         channels: Maps the topic of each channel that may occur to its description.
-        receivers: Maps the key of messages of the session to the function that receives these
-            messages.
+        receivers: Maps each key under which messages of the session are published to the
+            function that receives these messages.
     """
 
     def __init__(
@@ -514,8 +514,8 @@ class VizChannels:
     def finish(self, log_ns: int) -> None:
         """Writes the remaining messages for viewers at the end of the log.
 
-        Before that, a message for viewers is written when the time interval that it covers is
-        over.
+        Otherwise, the messages about a time interval are written only after the interval has
+        ended.
 
         Args:
             log_ns: Arrival time of the last message of the session in Unix time, in ns.
@@ -581,8 +581,7 @@ def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[flo
         curves: Values of each curve in chronological order, at least one. All are finite.
 
     Returns:
-        For each curve the extreme that occurs first, and for each curve the extreme that occurs
-        second.
+        The earlier extreme of each curve, and the later extreme of each curve.
     """
     earlier: list[float] = []
     later: list[float] = []

@@ -306,7 +306,8 @@ time.
 class Refusals:
     """Counts the messages from ROS programs that could not be used, grouped by reason.
 
-    A faulty ROS program therefore cannot stop this process, and the user is told what is wrong.
+    A faulty ROS program cannot stop this process, because errors in its messages are only
+    counted and reported to the user.
 
     Args:
         report: Function that receives a sentence when a reason occurs for the first time.
@@ -565,7 +566,7 @@ class Ros2Graph:
         """
 
         def check_publisher(token: zenoh.Sample) -> None:
-            """Counts a rejection when a publisher appears that this node cannot receive.
+            """Counts a rejection if the messages of a new publisher cannot reach this node.
 
             Zenoh calls this function with the token of each publisher that appears or
             disappears. A mismatch is, for example, another message type on the same topic.

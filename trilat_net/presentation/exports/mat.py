@@ -45,8 +45,8 @@ def _write(log: Log, path: Path, written: Written) -> None:
 
         Args:
             table: Table of the log, such as the records of a site.
-            table_name: Name of the table: "m1" for the records of site m1, and "m1.link" for
-                another table of this site, which becomes a field of its struct.
+            table_name: Name of the table: "m1" for the records of site m1, or for example
+                "m1.link" for another table of the site, which becomes a field of the struct m1.
         """
         struct = _build_struct(table)
         site, _, kind = table_name.partition(".")

@@ -157,7 +157,7 @@ class DelayAxis(NamedTuple):
 
     @property
     def is_logarithmic(self) -> bool:
-        """True if only a few values are large, so that a linear axis would hide the others."""
+        """True if the axis is logarithmic, because a few values are far above the rest."""
         return bool(self.x_ms[0] > 0.0)
 
     @classmethod

@@ -106,8 +106,8 @@ class _ArmPose(NamedTuple):
         """Returns all points drawn for this pose, from which the picture limits are computed.
 
         Returns:
-            The points of the arms, of their paths and of the touched bodies, in m, shape (K,
-            2).
+            The points of the arm, of its reference pose, path and shadow, and of the bodies, in
+            m, shape (K, 2).
         """
         parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
         return np.concatenate(parts)

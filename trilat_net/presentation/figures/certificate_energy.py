@@ -133,11 +133,12 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energies that the control laws account for, in J over time.
+    """Draws the energies that the control laws keep account of, in J over time.
 
-    Some control laws ensure stability by never returning more energy than they received, and
-    record this account. There is one panel per kind of energy: in transit between sites, known
-    to the receivers, stored, and exchanged with the arms. Curves of energy in transit use the
+    Some control laws ensure stability by never returning more energy than they received. There
+    is one panel per kind of energy: the energy in transit between sites, the part of it that
+    the receivers know, the energy stored by the laws, and the energy that the arms gave to the
+    laws, together with the energy that the laws dissipated. Curves of energy in transit use the
     colour of the receiving site.
 
     Args:

@@ -711,7 +711,8 @@ def thin_path(path: Array) -> Array:
     time keeps as many points in the fast parts of the path as in the slow ones.
 
     Args:
-        path: Points of the path, shape (K, 2), K > 0. Each axis is scaled to its own extent.
+        path: Points of the path, shape (K, 2), K > 0. Distances along each axis are measured as
+            fractions of the extent of the path along that axis.
 
     Returns:
         A subset of the points, shape (P, 2).
