@@ -221,11 +221,11 @@ class Layout(NamedTuple):
         return columns
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the recorded values needed to resume a run with the arm at rest.
+        """Counts the recorded values that contain the state of the rule `glide`.
 
-        Under the rule `glide`, an arm comes to rest while another arm is silent (see
-        `core.life.session_life`). The state of this rule is stored at the start of the field
-        `mem`:
+        Under this rule, an arm comes to rest while another arm is silent (see
+        `core.life.session_life`). The values are needed to resume a run while the arm is at
+        rest, and are stored at the start of the field `mem`:
 
         - values stored for every arm, for example the time of the last sample from each other
           arm,

@@ -50,7 +50,7 @@ class Result:
     def summary(self) -> str:
         """Returns the text that the command prints in the terminal.
 
-        A command with the option --all prints the complete text only if this option is given.
+        For a command with the option --all, this is the text that it prints with the option.
         """
         return str(find_hook("summarize a result")(self))
 

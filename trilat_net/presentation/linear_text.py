@@ -184,10 +184,10 @@ def _tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 
 def describe_moving_states(states: Sequence[str]) -> str:
-    """Returns a phrase with the states of a loop that move together, grouped by state.
+    """Returns a phrase that lists the states of a loop that move together, and their sites.
 
-    Sites that share a state are listed together: "q2 of m1, m2, s" stands for the second joint
-    angle of three sites.
+    Each state is listed once, with all of its sites: "q2 of m1, m2, s" stands for the second
+    joint angle of three sites.
 
     Args:
         states: Names of the states, each prefixed with the name of its site, such as "m1.q2".
@@ -282,8 +282,8 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     - absolute stability: the arms are stable with any passive operators,
     - transparency: the impedance that an operator feels while another arm is free or clamped.
 
-    If the arms are unstable even without operators, the other properties are undefined and the
-    text ends there. If they are unstable while one of them is clamped, the lines about
+    If the arms are unstable even without operators, the text says so and omits the lines about
+    these properties. If the arms are unstable while one of them is clamped, the lines about
     transparency are omitted.
 
     Args:

@@ -52,8 +52,8 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
 
     Args:
         log: Log of the run.
-        builder: Builder of the charts, which provides the bounding box of the motion and the
-            scale.
+        builder: Builder of the charts, which provides the bounding box of the motion, and the
+            scale of the pictures of the arms.
         charts: Charts of the page.
     """
     html = Markup()

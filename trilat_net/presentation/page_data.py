@@ -35,8 +35,8 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
         series: Lines of the chart.
         sites: Names of the sites whose modes and changes are marked in the chart.
         lines: Horizontal lines at values specified by the scenario, such as a mean delay.
-        links: True to also mark changes of links, and to draw the horizontal lines above the
-            series.
+        links: True to also mark changes of links, and to draw the horizontal lines in front of
+            the series.
         log: True for a logarithmic value axis.
         zero: True if the value axis starts at 0.
         margin: Minimum space above the values, as a fraction of the largest value.
@@ -95,7 +95,7 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
 class HistogramChart(
     msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"
 ):
-    """A histogram of a duration measured in every tick, such as the lateness.
+    """A histogram of a duration measured in every tick, such as the lateness of the tick.
 
     The bins have equal widths on a logarithmic axis.
 
@@ -185,8 +185,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
         spans: For each site, the intervals in which it does not follow its peers.
         arms: Arms of the sites that have records.
         leads: Dominance factors of each slave whose factors change, in the order of the bars.
-        bounds_m: Left, right, bottom and top of the pictures of the arms, in the units of these
-            pictures.
+        bounds_m: Left, right, bottom and top of the pictures of the arms, in picture units.
     """
 
     class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):

@@ -49,7 +49,7 @@ def render_folds(folds: Iterable[Markup]) -> Markup:
     While collapsed, the parts share a single line.
 
     Args:
-        folds: HTML of each part, from `render_details`. Parts that do not exist are empty.
+        folds: HTML of each part, from `render_details`. Empty for a part that is omitted.
     """
     return _render("folds", folds=folds)
 

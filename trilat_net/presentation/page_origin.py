@@ -80,8 +80,8 @@ def describe_changes(scenario: Scenario) -> str:
     """Returns how a scenario differs from the shipped scenario with the same name and title.
 
     The title and description of a scenario refer to its original settings, but a run with other
-    settings, for example from `trilat rerun`, keeps them. The reader must therefore be told
-    about the differences.
+    settings, for example from `trilat rerun`, has the same title and description. The reader
+    must therefore be told about the differences.
 
     Args:
         scenario: Scenario of the run.

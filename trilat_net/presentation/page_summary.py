@@ -255,9 +255,10 @@ class _KeyNumber(NamedTuple):
 
 
 def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
-    """Renders the most important figures of a run: its errors and the delay in use.
+    """Renders the most important figures of a run: its errors, settling time and delays.
 
-    They are shown below the verdict, for readers who read nothing else.
+    The delays are the ages of the samples that the sites used. The figures are shown below the
+    verdict, for readers who read nothing else.
 
     Args:
         log: Log of the run.

@@ -1,4 +1,4 @@
-"""Composes the text that compares a run with its re-execution under other settings."""
+"""Composes the text that compares a run with its rerun under other settings."""
 
 from collections.abc import Iterator
 
@@ -9,13 +9,13 @@ from .result_text import Block, TextTable
 
 
 def compose_rerun(rerun: Rerun) -> Iterator[Block]:
-    """Yields the result of re-executing some sites of a log with changed settings.
+    """Yields the text that compares a rerun with the log of the original run.
 
-    The text names the executed sites and the changed settings, and compares the motion of each
-    site and the sample ages of each link with the log.
+    The text names the sites that were computed again and the changed settings. It compares the
+    motion of their arms, and the ages of the samples that they used, with the log.
 
     Args:
-        rerun: Result of the re-execution.
+        rerun: Result of the rerun.
     """
     request = rerun.request
     recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
@@ -93,12 +93,12 @@ def _name_sample(tick: object) -> str:
 
 
 def _describe_site_effect(rerun: Rerun, site: str) -> list[str]:
-    """Returns lines about the differences between the log of an arm and its re-execution.
+    """Returns lines about the differences between an arm in the log and in the rerun.
 
     The lines state the largest deviation of the joint angles, and the first value that differs.
 
     Args:
-        rerun: Result of the re-execution.
+        rerun: Result of the rerun.
         site: Name of the site.
     """
     effect = rerun.sites[site]

@@ -287,7 +287,7 @@ def name_shared(log: Log) -> list[str]:
 
 
 def flatten_rounding(axes: Axes) -> None:
-    """Widens the value axis of a panel whose curves differ only by rounding errors.
+    """Widens the value axis of a panel whose values differ only by rounding errors.
 
     Otherwise Matplotlib would scale the axis to the rounding errors, and a constant would look
     like noise.
@@ -631,8 +631,8 @@ class TimeFigure:
     def add_joint_panels(self, joints: int, below: str = "") -> _JointPanels:
         """Adds one panel per joint to the figure, and optionally a wide panel below them.
 
-        Two joints share a value axis. With more joints, each has its own, because wrist torques
-        are much smaller than shoulder torques.
+        If there are two joints, their panels share a value axis. If there are more, each panel
+        has its own, because wrist torques are much smaller than shoulder torques.
 
         Args:
             joints: Number of joints.

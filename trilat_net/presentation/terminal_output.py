@@ -160,7 +160,7 @@ def print_line(text: str) -> None:
 def print_table(table: "TextTable") -> None:
     """Prints a table that fits the width of the terminal.
 
-    If the output is not a terminal, the table may be at least `_PIPE_WIDTH` columns wide.
+    If the output is not a terminal, the available width is at least `_PIPE_WIDTH` characters.
 
     Args:
         table: The table.
@@ -418,12 +418,12 @@ def warn_of_damage(log: "Log") -> None:
 
 
 def warn_user_laws(log: "Log") -> None:
-    """Tells the user which user-written control laws will run when a log is re-executed.
+    """Tells the user which user-written control laws will run when a run is computed again.
 
     The warning also lists laws that cannot run because the user has not permitted them.
 
     Args:
-        log: The log.
+        log: The log of the run.
     """
     for law in log.scenario.inspect_user_laws():
         if law.allowed:

@@ -248,9 +248,9 @@ def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms the energy function V in the stability proof does not exist.
+    """Explains for which arms, and why, the stability proof has no energy function V.
 
-    In that case, a certificate judges the run without V.
+    If there is such an arm, a certificate judges the run without V.
 
     Args:
         scenario: Scenario of the run.

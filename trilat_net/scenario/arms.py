@@ -293,10 +293,10 @@ class ArmModel(NamedTuple):
         counts: Lengths of the arm's vectors.
         joint_names: Names of the joints, from the base to the tip.
         link_names: Names of the links moved by the joints.
-        efforts: Effort limit of each joint from the file, in N m or N; inf if the file has
+        efforts: Effort limit of each joint from the URDF file, in N m or N; inf if the file has
             none.
-        speeds: Speed limit of each joint from the file, in rad/s or m/s; inf if the file has
-            none.
+        speeds: Speed limit of each joint from the URDF file, in rad/s or m/s; inf if the file
+            has none.
         lengths_m: Lengths of the two links of the planar arm, in m; (0, 0) for a chain.
         chain: The chain in the record format read by the simulation kernel; None for the planar
             arm.

@@ -63,7 +63,7 @@ class Distribution(_DistributionKeys, frozen=True, omit_defaults=True, kw_only=T
     """Distribution of a random number in a scenario, together with the drawn number.
 
     The value can also be an operator's pose that was copied from the random start pose of an
-    arm. In that case, both distributions are None.
+    arm. In that case, both `normal` and `uniform` are None.
 
     Attributes:
         value: The drawn number, or the copied pose.

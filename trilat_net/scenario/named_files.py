@@ -50,7 +50,7 @@ class NamedFiles(NamedTuple):
                 is rejected.
 
         Raises:
-            ScenarioError: A file cannot be read, or no file may be named.
+            ScenarioError: A file cannot be read, or must be read although `folder` is None.
         """
         arms = {"arm": tables.get("arm", {})}
         arms |= {
@@ -81,8 +81,8 @@ class NamedFiles(NamedTuple):
     def read_trace(self, link: TomlTable, name: str, path: str) -> str:
         """Returns the delay trace of a link, from its table or from the file that it names.
 
-        The file is either a CSV file of times and delays, or a log. In a log, the delays of the
-        link `of` are read, by default those of the link called `name`.
+        The file is either a CSV file of times and delays, or a log. From a log, the delays of
+        the link named by the key `of` are read, by default those of the link `name`.
 
         Args:
             link: Table of a link with the delay model "trace".
@@ -122,11 +122,11 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
 
     Args:
         name: Name of the file, as given in the arm table.
-        folder: Folder of the scenario. If None, no file may be named.
+        folder: Folder of the scenario. If None, the file is rejected.
         path: Path of the key that names the file, for error messages.
 
     Raises:
-        ScenarioError: The file cannot be read, or no file may be named.
+        ScenarioError: The file cannot be read, or `folder` is None.
     """
     if folder is None:
         raise ScenarioError("no file may be named here", path=path)

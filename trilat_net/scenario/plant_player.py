@@ -150,7 +150,7 @@ class PlantPlayer:
             plant.
 
         Raises:
-            CodeWithheld: A class may not run.
+            CodeWithheld: Nobody has permitted the code of a class to run.
             ScenarioError: A plant cannot be created.
         """
         return {

@@ -37,7 +37,7 @@ from .written_tables import WrittenChange, WrittenScenario
 
 
 def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
-    """Fills in all defaults and named files of a scenario.
+    """Fills in all defaults of a scenario, and the contents of the files that it names.
 
     The result describes the experiment completely and depends on no other file.
 

@@ -76,7 +76,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         about: One-paragraph description.
         assumed: Assumptions made where the source of the experiment is silent.
         duration_s: Duration of the run, in s.
-        seed: Random seed, of which every random draw is a function.
+        seed: Random seed, which determines every random draw.
         scheme: Integration scheme, "second_order" or "digital" (see `SiteSetup.digital`).
         sites: Ordered mapping from site name to site. The first site leads a live session.
         dominance: Matrix of dominance factors, Eq. (6). The entry in row i and column j is the
@@ -193,7 +193,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         The dominance factors alpha are reversible if there is a diagonal matrix D > 0 for which
         D (I - alpha) is symmetric, where I is the identity matrix. Some stability conditions
         require this. False if a control law exchanges more than positions or does not
-        compensate for gravity, because the condition does not apply in that case.
+        compensate for gravity, because those conditions do not apply in that case.
         """
         laws = [spec.control for spec in self.sites.values()]
         if not all(law.exchanges_positions() for law in laws):
@@ -212,8 +212,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def law_situations(self) -> Iterator[tuple[str, LawSettings, LawSituation]]:
         """Yields each site with its control law and the quantities that affect stability.
 
-        These are the delays, the rates of the control loops, and the dominance factors. If the
-        law has a stability condition, it uses these quantities to evaluate the condition.
+        These quantities include the delays, the rates of the control loops, and the dominance
+        factors. If the law has a stability condition, the condition is evaluated from them.
         """
         delay_s = np.zeros((len(self.names), len(self.names)))
         for name, link in self.links.items():
@@ -472,7 +472,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Raises ScenarioError if a real robot lacks limits or its reference could jump.
 
         The check is made only before a session, since the scenarios in logs of earlier versions
-        may lack these keys.
+        may lack these limits.
         """
         for name in self.outside:
             problem = self.sites[name].find_outside_problem(self.arms[name])
@@ -484,8 +484,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def simulated_settings(self) -> dict[str, Any]:
         """Overrides that make the scenario run with simulated arms only.
 
-        A mapping from dotted key to new value. The overrides are needed because the masses of a
-        simulated arm are known, and only a real arm has a dead-man switch.
+        A mapping from dotted key to new value. The overrides also mark the masses of the arms
+        as known, and remove dead-man switches, which only real arms have.
         """
         settings: dict[str, Any] = {}
         for name in self.external:
@@ -715,7 +715,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """Returns the gains of a site's control law, in the form read by the control loop.
 
         If the law is adaptive and the site can stop smoothly (`on_stale.action` is "glide"),
-        the record includes bounds on the estimated parameters.
+        the result includes bounds on the estimated parameters.
 
         Args:
             site: Name of the site.

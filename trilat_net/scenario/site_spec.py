@@ -119,8 +119,9 @@ def _or_infinity(limit: Any) -> Any:
 class Limits(Frozen, frozen=True):
     """Limits of one arm, such as its largest torque, given per joint or for all joints.
 
-    Exceeding a limit ends the run or, under the stale rule "glide", only brings this arm to
-    rest.
+    The control torque, its rate of change and the speed of the reference are kept within their
+    limits. A joint that exceeds its speed limit ends the run or, under the stale rule "glide",
+    only brings this arm to rest.
 
     Attributes:
         tau_limit_nm: Largest control torque of a joint, in N m. The torque is clipped to this
@@ -256,7 +257,7 @@ class SiteSpec(Frozen, frozen=True):
 
     @property
     def needs_hand_process(self) -> bool:
-        """True if a user's program operates the arm from a process of its own when live.
+        """True if, in a live session, a user's program operates the arm from its own process.
 
         A slow program then does not delay the control loop of the site.
         """
@@ -280,8 +281,8 @@ class SiteSpec(Frozen, frozen=True):
     def with_live_hand_only(self, mode: str = "") -> "SiteSpec":
         """Returns a copy of the site whose only operator is an open live operator.
 
-        The settings are those of the site's open live operator if there is one, and the
-        defaults otherwise.
+        An open operator is one whose role any member of the session may take. The settings are
+        those of the site's open live operator if there is one, and the defaults otherwise.
 
         Args:
             mode: Mode of the operator, one of `HAND_MODES`. If empty, the mode is kept.
@@ -348,7 +349,7 @@ class SiteSpec(Frozen, frozen=True):
             arm: Model of the robot.
 
         Returns:
-            The first such key and its problem, or None.
+            The first problem found and the key that it concerns, or None.
         """
         for key in _OUTSIDE_LIMITS:
             if getattr(self.limits, key) is None:
@@ -400,8 +401,8 @@ class SiteSpec(Frozen, frozen=True):
     def describe_jump(self) -> KeyProblem:
         """Returns why the reference of a real robot may jump when a peer falls silent.
 
-        A jump would move the robot suddenly, so the stale rule must be "glide". The site has
-        another rule.
+        A jump would move the robot suddenly, so the stale rule must be "glide". Call this
+        method only if the site has another rule.
 
         Returns:
             The key of the stale rule, and the problem.

@@ -43,7 +43,7 @@ class _SharedByAll(NamedTuple):
     Attributes:
         rate_hz: Default tick rate, in Hz.
         control: Table `control` for all sites, as written by its author.
-        draws: Draws the numbers that are specified as distributions.
+        draws: Object that draws the numbers that are specified as distributions.
         files: Files that the sites name.
         chains: True if the arms are modelled as general chains of joints.
     """
@@ -66,7 +66,7 @@ def complete_site_tables(
     Args:
         tables: Tables of the scenario file.
         rate_hz: Default tick rate, in Hz.
-        draws: Draws the numbers that are specified as distributions.
+        draws: Object that draws the numbers that are specified as distributions.
         files: Files that the sites name.
 
     Raises:

@@ -88,8 +88,8 @@ Since their arguments differ, messages about misplaced keys do not mention these
 class WrittenSite(Frozen, frozen=True, kw_only=True):
     """Table of one site as written by an author.
 
-    `site_spec.SiteSpec` is the complete form. The keys of `control`, `view` and the tables in
-    the lists depend on the kind named in the table.
+    `site_spec.SiteSpec` is the complete form. The keys of `control`, of `view`, and of each
+    table in `hands` and `environment` depend on the kind that the table names.
     """
 
     role: Literal["master", "slave"] | UnsetType = UNSET

@@ -145,7 +145,8 @@ class WorkerRequirements(NamedTuple):
         program versions must not be mixed.
 
         Raises:
-            UsageError: This process differs. The message names the worker and the differences.
+            UsageError: This worker does not meet the requirements. The message names the worker
+                and the differences.
         """
         reason = self.explain_unfit_worker(describe_worker(), self.find_missing_laws(self.laws))
         if reason:
@@ -154,7 +155,7 @@ class WorkerRequirements(NamedTuple):
 
     @staticmethod
     def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-        """Returns the user-written control laws whose file is missing here or differs.
+        """Returns the user-written control laws whose file is missing or different here.
 
         A worker without the right file could not run the study, or would compute different
         results.
@@ -345,7 +346,7 @@ class DaskCluster:
             error: The exception with which an item ended.
 
         Returns:
-            True if the workers of the item died.
+            True if the workers that ran the item died.
 
         Raises:
             RunFailed: The scheduler no longer responds, or a worker cannot receive items.

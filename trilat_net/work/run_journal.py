@@ -253,7 +253,7 @@ class RunJournal(Generic[E]):
     def add(self, entry: E) -> None:
         """Writes the result of a finished run to the journal file immediately.
 
-        An interruption of the study then cannot lose the run. A run that is already in the
+        The run is then not lost if the study is interrupted. A run that is already in the
         journal is ignored.
 
         Args:

@@ -55,8 +55,8 @@ def figure(
         width_in: Width of the figure: 3.5 in for one column of a paper, or 7 in for two.
 
     Raises:
-        UsageError: The figure or the width does not exist, or the log has nothing to show in
-            the figure.
+        UsageError: There is no such figure, the width is neither 3.5 nor 7 in, or the log has
+            nothing to show in the figure.
     """
     form = FigureSize.for_print(width_in)
     opened = log if isinstance(log, Log) else open_log(log)
@@ -99,8 +99,8 @@ def write_figures(
         The paths of the files.
 
     Raises:
-        UsageError: A figure, the width or a format does not exist, the log has nothing to show
-            in a figure, or a file exists.
+        UsageError: A figure or a format is unknown, the width is neither 3.5 nor 7 in, the log
+            has nothing to show in a figure, or a file exists.
     """
     form = FigureSize.for_print(width_in)
     unique_names = list(dict.fromkeys(names))
@@ -133,14 +133,15 @@ def write_overlay(
 ) -> list[Path]:
     """Writes figures that compare several runs, such as overlay.pdf and overlay_positions.pdf.
 
-    The figure "overlay" shows the largest values of each run. The other figures have one panel
-    per arm and joint.
+    The figure "overlay" shows the largest values across all arms, with one line per run.
+    The other figures have one panel per arm and joint.
 
     Args:
         logs: Mapping from the legend name of each run to its log.
         folder: Folder for the files. Created if it does not exist.
         names: Names of the figures: overlay, positions, tracking_errors or control_torques. If
-            empty, all of them are written, or only overlay if the others cannot show the runs.
+            empty, all of them are written, or only overlay if there are too many runs for the
+            others or the runs have no site in common.
         width_in: Width of the figures, 3.5 or 7 in.
         formats: File formats, from `FIGURE_FORMATS`.
         force: True to overwrite existing files.
@@ -149,8 +150,9 @@ def write_overlay(
         The paths of the files.
 
     Raises:
-        UsageError: A figure, the width or a format does not exist, the errors of the logs have
-            different units, the logs cannot be drawn in a figure, or a file exists.
+        UsageError: A figure or a format is unknown, the width is neither 3.5 nor 7 in, the
+            errors of the logs have different units, the logs cannot be drawn in a figure, or a
+            file exists.
     """
     form = FigureSize.for_print(width_in)
     known_names = (OVERLAY, *COMPARED_SIGNALS)
@@ -192,7 +194,7 @@ def write_report_figures(
         twin: Log of the same run without operators. `None` to omit the figure that shows how
             far operators moved the arms.
         progress: Function that is called with the number of drawn figures and the total number.
-        pushed: Growth of small pushes in repetitions of the run. `None` to compute it here.
+        pushed: Effects of small pushes in repetitions of the run. `None` to compute them here.
 
     Returns:
         The paths of the files.
@@ -241,7 +243,7 @@ def _write(
         The paths of the files.
 
     Raises:
-        UsageError: A format does not exist, or a file exists.
+        UsageError: A format is unknown, or a file exists.
     """
     unique_formats = list(dict.fromkeys(formats))
     for file_format in unique_formats:

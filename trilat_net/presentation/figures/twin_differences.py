@@ -83,13 +83,13 @@ class _DifferenceLine(NamedTuple):
 
 
 def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws how small pushes grow or decay in repetitions of a run.
+    """Draws how the effects of small pushes grow or decay in repetitions of a run.
 
     Each repetition (twin) is identical to the run except for a small push. The upper panel
     shows the differences in joint velocity between the twins and the run, in rad/s, with one
     line per push, or one line per joint if there was only one push. The lower panel shows the
-    joint speeds of the run. If there are no twins, the figure shows the reason. The title
-    describes in a sentence how the pushes develop.
+    joint speeds of the run. If there are no twins, the figure shows the reason. The title is a
+    sentence about the effects of the pushes, see `PushedTwins.headline`.
 
     Args:
         pushed: The run and its twins.

@@ -127,8 +127,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def repetition_s(self) -> Fraction | None:
         """Period after which the delay repeats, in s, or None if the delay has no period.
 
-        The period is a fraction of whole numbers, which makes common multiples of periods
-        exact.
+        The period is a `Fraction`, so that common multiples of periods can be computed exactly.
         """
         return None
 

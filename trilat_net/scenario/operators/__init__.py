@@ -45,7 +45,7 @@ class HeldArm(NamedTuple):
         q0_rad: Start pose of the arm, in rad. Not validated yet.
         end_effector_m: Function that returns the position of the end effector in the start
             pose, in m.
-        draws: Draws the numbers for random distributions in the settings.
+        draws: Object that draws the numbers for random distributions in the settings.
     """
 
     counts: VectorCounts

@@ -77,8 +77,8 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
     """Base class of operators who pull the arm towards a moving target.
 
     The operator acts through a spring and a damper. The target moves along a minimum-jerk path.
-    The first four fields of a subclass must be the end of the path, its start (by default the
-    start of the arm), the stiffness and the damping, in this order.
+    The first four fields of a subclass must be the end of the path, the start of the path (by
+    default, where the arm starts), the stiffness and the damping, in this order.
 
     Attributes:
         move_start_s: Time at which the target starts to move, in s.

@@ -233,7 +233,7 @@ class HandSite(NamedTuple):
         Imports the class, provided that a person has permitted its code to run.
 
         Raises:
-            CodeWithheld: The class may not run.
+            CodeWithheld: Nobody has permitted the code of the class to run.
             ScenarioError: The class cannot be imported or instantiated.
         """
         path = f"sites.{self.name}.hands"
