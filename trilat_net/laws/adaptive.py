@@ -51,7 +51,7 @@ class Adaptive(ControlLaw):
     Attributes:
         Lambda: Rate at which errors decay, per joint, 1/s.
         Kp: Damping of r = qd + Lambda e, per joint, N m s/rad.
-        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        Kd: Damping of the error, per joint, N m s/rad.
         Gamma: Adaptation gain per parameter.
         theta_hat0: Initial estimate of theta, Eq. (24).
     """

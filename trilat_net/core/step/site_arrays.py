@@ -12,8 +12,8 @@ Invariant:
     - The compiled code of a control period reads and writes nothing but these arrays and
       `TickBuffers`.
     - Two arms with equal setups have equal arrays.
-    - The links of an arm use at most `MAX_LINKS_BYTES` of memory in addition to what the delays
-      in the setup require.
+    - The links of an arm use at most `MAX_LINKS_BYTES` of memory, unless the delays in the setup
+      require more.
 """
 
 from collections.abc import Sequence
@@ -589,7 +589,7 @@ see `fold_ramps`.
 _NEAR_NS = NS_PER_S // 4
 """How far senders may be ahead of a slightly late receiver without a larger buffer, ns."""
 MAX_LINKS_BYTES = 64 << 20
-"""Largest memory of a site's links in addition to what their delays require, bytes."""
+"""Largest memory of a site's links, unless their delays require more, bytes."""
 _SLACK = 4
 """Reserve in ticks, because a sample is scheduled up to two ticks before it is stored."""
 _NEVER_SAMPLED = 2

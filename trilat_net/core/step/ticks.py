@@ -274,14 +274,14 @@ _REASONS = {
 
 
 class LifeAlarm(NamedTuple):
-    """An alarm that explains why an arm is not following the others, and how to fix it.
+    """An alarm that explains why an arm does not follow all the others, and how to end this.
 
     It is created by `LifeAlarm.find`. Web pages and terminals show it as long as the site needs
     attention.
 
     Attributes:
-        word: The mode, in capitals.
-        reason: Reason for the mode.
+        word: The mode in capitals, or, for example, "WITHOUT m2" if the peer m2 is lost.
+        reason: Reason for the alarm.
         advice: Remedy, for a user at a terminal.
         order: Order that ends the alarm ("enable" or "reset"), for which a page has a button.
             Empty if no order ends the alarm.
