@@ -41,7 +41,7 @@ Maps each mode to the method of `tn.hand` and the suffix of the keys of a comman
 @RobotConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatRobotConfig(RobotConfig):
-    """Settings of a `TrilatRobot`: the session, and the site that the policy drives.
+    """Settings of a `TrilatRobot`: the session, and the master that the policy drives.
 
     Attributes:
         session: Name of the session.
@@ -105,18 +105,18 @@ class TrilatRobot(Robot):
     def observation_features(self) -> dict[str, type]:
         """Names and types of the values that LeRobot receives as an observation of the robot.
 
-        An observation contains the states of both arms, and the position and force of the
-        operator, the program that moves the master. For each joint, it contains the angle in
-        rad, the velocity in rad/s and the external torque in N m. For the operator, it contains
-        the position in m and the force on the operator in N, or angles in rad and torques in N
-        m in mode `joint`.
+        An observation contains the angle in rad, the velocity in rad/s and the external torque
+        in N m of each joint of both arms. It also contains the position of the master's end
+        effector in m, and the force in N that the master exerts on the operator (the program
+        that moves the master). In mode `joint`, these are the angles of the master in rad and
+        torques in N m.
         """
         keys = [*self._joint_keys, *self._position_keys, *self._felt_keys]
         return dict.fromkeys(keys, float)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Keys of an action, which is a command of the operator.
+        """Keys of an action, which is a command to the operator that moves the master.
 
         Depending on the mode in the scenario, the command is a position in m (mode `tip`),
         angles in rad (`joint`) or a force in N (`force`).
@@ -200,9 +200,9 @@ class TrilatRobot(Robot):
     def get_observation(self) -> dict[str, float]:
         """Returns the newest states of the slave and of the driven master, for the policy.
 
-        The state of an arm consists of the angles, velocities and external torques of its
-        joints, followed by the position of the operator and the reaction to the operator's
-        force.
+        The values are the angles, velocities and external torques of the joints of each arm,
+        followed by the position of the master and the force that the master exerts on the
+        operator.
 
         Returns:
             Values with the keys of `observation_features`.
@@ -325,7 +325,7 @@ def run_policy(
         decide: The policy. Its argument has the keys of an exported dataset,
             `observation.state` and `observation.environment_state`. It returns one number for
             each key of `action_features`.
-        duration_s: Time after which the policy ends, in s.
+        duration_s: Time for which the policy runs, in s.
         fps: Number of decisions per second, as in the training dataset.
 
     Returns:
@@ -375,8 +375,8 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
         """Returns the action of the trained policy for an observation, as a list of numbers.
 
         Args:
-            state: Maps each feature of the observation to its values. Features with which the
-                policy was not trained are left out.
+            state: Maps each feature of the observation to its values. Features that the policy
+                was not trained on are ignored.
         """
         tensors = {
             key: torch.tensor([numbers], dtype=torch.float32)

@@ -39,7 +39,7 @@ Maps each mode to the method of `tn.hand` and the suffix of the keys of a comman
 @TeleoperatorConfig.register_subclass("trilat")
 @dataclass(kw_only=True)
 class TrilatTeleoperatorConfig(TeleoperatorConfig):
-    """Settings of a `TrilatTeleoperator`: the session, and the sites of person and policy.
+    """Settings of a `TrilatTeleoperator`: the session, and the sites of the person and policy.
 
     The person and the policy each hold a master arm, and the slave arm follows both.
 
@@ -103,7 +103,7 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Keys of feedback, which is a command of the operator.
+        """Keys of the feedback, which is a command to the operator that moves the person's arm.
 
         Depending on the mode in the scenario, the command is a position in m (mode `tip`),
         angles in rad (`joint`) or a force in N (`force`).
@@ -208,7 +208,7 @@ class TrilatTeleoperator(Teleoperator):
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm: the operator can move it freely, and force feedback has no effect.
+        """Releases the arm: the person can move it freely, and `send_feedback` has no effect.
 
         Call `enable_torque` to allow feedback again.
         """

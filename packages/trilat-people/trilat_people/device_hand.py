@@ -50,7 +50,8 @@ class DeviceHand:
     Created by the process of a live operator, which then calls `run`.
 
     Args:
-        hand: Connection to the site of the arm, in the role of its operator.
+        hand: Connection to the site of the arm, through which this object acts as the arm's
+            operator.
         device: The input device.
         scenario: Scenario of the session. The device settings of the live operator determine
             how the device moves the arm and how the force is rendered.
@@ -258,10 +259,10 @@ class DeviceHand:
     def describe(self) -> str:
         """Returns a line of text with statistics of device states and round-trip times.
 
-        A state is dropped if it cannot be read or is a jump, that is, farther from the previous
-        position than the speed limit of the scenario allows. A round trip lasts from sending a
-        device position to the arm until the device renders the force with which the arm reacts
-        to it.
+        A state is ignored if it contains NaN or infinity (unreadable), or if its position is
+        farther from the previous position than the speed limit of the scenario allows (a jump).
+        A round trip lasts from sending a device position to the arm until the device renders
+        the force with which the arm reacts to it.
 
         Returns:
             The number of states received, of jumps and of unreadable states, and, if a round

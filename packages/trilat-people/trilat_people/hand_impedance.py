@@ -100,7 +100,7 @@ class HandImpedance(Result):
             (n, n).
         segments: Number of segments of the run.
         segment_s: Duration of a segment, in s.
-        responses: Responses at the frequencies of the sines, in ascending order.
+        responses: Responses of the hand at the excitation frequencies, in ascending order.
     """
 
     site: str
@@ -234,8 +234,8 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
         intervals.
 
     Raises:
-        UsageError: The run has no such site or no sines, is too short, or its motion along some
-            axes is too similar to separate them.
+        UsageError: The run has no such site, contains no excitation by sines or is too short,
+            or the end effector did not move along enough axes or at enough frequencies.
     """
     if not isinstance(log, Log):
         log = open_log(log)

@@ -150,7 +150,7 @@ class TargetTopic:
     holds the arm.
 
     Args:
-        hand: Connection to the site, in the role of the operator.
+        hand: Connection to the site, through which the ROS program acts as the arm's operator.
         read: Function that converts a message to a target. Raises ValueError for an invalid
             message.
         apply: Function that sends a target to the site.
@@ -313,7 +313,7 @@ class _SilenceNotice:
         self._other_joints: Sequence[str] = ()
 
     def note_message(self, other_joints: Sequence[str] = ()) -> None:
-        """Records that a message of the robot has arrived, whether or not it is a measurement.
+        """Records that a message from the robot has arrived, even if it is not a measurement.
 
         Args:
             other_joints: Names of the joints in the message, if none of them belongs to the
@@ -324,7 +324,7 @@ class _SilenceNotice:
             self._other_joints = other_joints
 
     def note_measurement(self) -> None:
-        """Records that a measurement of the robot was sent to the site.
+        """Records that a measurement from the robot was sent to the site.
 
         The sequence of notices then starts over.
         """
@@ -362,12 +362,12 @@ class _SilenceNotice:
 class RobotArm:
     """A ROS robot that is the external arm of a site.
 
-    The joint states of the robot are sent to the site, and the torque of the site is sent to
-    the controller of the robot, as in a driver that uses `ArmClient`. While the arm must brake,
-    the controller receives its safe command repeatedly.
+    The joint states of the robot are sent to the site, and the torque commanded by the site is
+    sent to the controller of the robot, as in a driver that uses `ArmClient`. While the arm
+    must brake, the controller receives its safe command repeatedly.
 
     Args:
-        make_client: Function that connects to the current start of the site.
+        make_client: Function that connects to the process in which the site currently runs.
         joints: Alternative names that the robot may use for each joint, in scenario order.
         robot: Settings of the robot.
         commands: Publisher of the commands to the controller.
@@ -411,7 +411,7 @@ class RobotArm:
         self._safe_ns = clock.monotonic_ns() - SAFE_PERIOD_NS
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Sends the joint states in a message to the site. Called in a thread of Zenoh.
+        """Forwards the joint states in a message to the site. Called in a thread of Zenoh.
 
         A message without any of the joints belongs to another robot and is ignored.
 
@@ -444,7 +444,7 @@ class RobotArm:
         self.silence.note_measurement()
 
     def send_command(self) -> None:
-        """Sends the robot the newest torque of the site, or the safe command if it must brake.
+        """Sends the robot the site's newest torque, or the safe command if the arm must brake.
 
         A torque is sent only once.
         """
@@ -845,8 +845,9 @@ def _describe_target(
     Args:
         scenario: Scenario of the session.
         site: Name of the site, which must have a live operator.
-        hand: Connection to the site, in the role of the operator. Its method `turn` sends joint
-            angles, `push` a force, and `move` a position of the end effector.
+        hand: Connection to the site, through which the ROS program acts as the arm's operator.
+            Its method `turn` sends joint angles, `push` a force, and `move` a position of the
+            end effector.
         frame: Name of the coordinate frame of the positions and forces in the messages.
 
     Returns:
@@ -992,7 +993,8 @@ def serve_ros2(
         table: Names of the topics, and settings of the robots.
         stopped: Function that returns True to end the call.
         say: Function that prints a line for the user.
-        timeout_s: Maximum time to wait for the first site or its router, in s.
+        timeout_s: Maximum time to wait for the first site of the session, or for the router
+            through which the site is reached, in s.
         rviz: Path of the RViz configuration to write, with which RViz shows the session. If
             None, no file is written.
 
@@ -1035,7 +1037,7 @@ def publish_session(
     say: Callable[[str], None],
     rviz: Path | None = None,
 ) -> bool:
-    """Waits until a session begins, and connects it with ROS 2 until the session ends.
+    """Waits until a session begins, and connects it to ROS 2 until the session ends.
 
     Robots are connected before the session begins, because the session begins only when their
     arms send measurements.

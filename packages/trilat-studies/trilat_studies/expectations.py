@@ -44,7 +44,7 @@ class ExpectationResult(msgspec.Struct, frozen=True):
     def list_of_run(cls, metrics: RunMetrics, expect: Expect) -> "list[ExpectationResult]":
         """Compares the metrics of a run with the expectations of its scenario.
 
-        If the run diverged (an arm left its limits), the expectation `stable` is always
+        If the run diverged (an arm exceeded its limits), the expectation `stable` is always
         reported, even if the scenario does not state it.
 
         Args:

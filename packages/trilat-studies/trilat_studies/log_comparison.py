@@ -108,7 +108,7 @@ class MetricComparison(NamedTuple):
             names: Names of the columns. Default: the file names of the logs.
 
         Raises:
-            LogError: A record cannot be read, or names a change that is not valid.
+            LogError: A record cannot be read, or contains an invalid change of a setting.
         """
         measured = [LogMetrics.of_log(log) for log in logs]
         rows = []

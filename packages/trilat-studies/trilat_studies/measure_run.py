@@ -36,7 +36,7 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     last second of the run. A link "j->i" leads from site j to site i.
 
     Attributes:
-        simulated_s: Duration of the run in its own time, in s.
+        simulated_s: Time from the start of the run to the end of its last control period, in s.
         end: Analysis of the end of the run, for example whether the arms came to rest.
         ages: Ages of the samples in use, by link "j->i".
         late_samples: Number of samples that arrived after the time at which they were due.
@@ -186,8 +186,8 @@ def _compute_run_metrics(
     Args:
         scenario: Scenario of the run.
         site_stats: Statistics of each site, in the order of the scenario.
-        diverged_at_s: Time at which the first site left the limits of its arm, in s. `None` if
-            no site did.
+        diverged_at_s: Time at which an arm first exceeded its limits, in s. `None` if no arm
+            did.
         late_samples: Number of samples that arrived too late.
         missing: Number of ticks without a record.
 
@@ -457,7 +457,7 @@ class _MeasuredRun:
         """Returns the metrics of the run.
 
         Args:
-            diverged_at_s: Time at which the first site left the limits of its arm, in s.
+            diverged_at_s: Time at which an arm first exceeded its limits, in s.
             late_samples: Number of samples that arrived too late.
         """
         scenario = self._scenario

@@ -31,7 +31,7 @@ class RecordBatch(NamedTuple):
 
     Metrics are computed from batches because statistics over arrays are much faster than over
     individual records. In the shapes below, K is the number of records, n the number of joints,
-    m the number of coordinates that the sites agree on, and P the number of peers.
+    m the number of coordinates that the sites exchange, and P the number of peers.
 
     Attributes:
         t_ns: Nominal times, shape (K,), in ns.
@@ -130,7 +130,7 @@ def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array)
         t_ns: Nominal times, shape (K,), in ns.
         used: Samples in use, shape (K, P), as in `RecordBatch`.
         vectors: The arrays q, qd, q_des, tau, tau_x and x, each of shape (K, ...). The pose x
-            of the end effector is empty if the sites agree on joint angles.
+            of the end effector is empty if the sites exchange joint angles.
     """
     q, qd, q_des, tau, tau_x, x = vectors
     in_task_space = x.size > 0
@@ -158,8 +158,8 @@ def run_in_batches(
         receivers: For each site, the function that receives its batches.
 
     Returns:
-        The time at which the first site left the limits of its arm, in s, or `None` if none
-        did; and the number of samples that arrived too late to be used as planned.
+        The time at which an arm first exceeded its limits, in s, or `None` if no arm did; and
+        the number of samples that arrived too late to be used as planned.
     """
     pending: dict[str, list[TickRecord]] = {name: [] for name in receivers}
     sites: dict[str, Site] = {}

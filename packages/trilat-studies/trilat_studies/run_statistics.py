@@ -358,7 +358,7 @@ class SiteStats:
 
     @property
     def tau_x(self) -> Array:
-        """Torque of operator and environment in the last record, in N m, shape (n,).
+        """Torque of the operator and the environment in the last record, in N m, shape (n,).
 
         It shows whether an operator still acts on the arm when the run ends. Before the first
         record, the array is a single zero.

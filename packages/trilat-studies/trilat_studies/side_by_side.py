@@ -24,7 +24,7 @@ us per site tick.
 
 
 class RunKind(NamedTuple):
-    """Runs of a study that probably differ only in numerical parameters, such as the seed.
+    """Runs of a study that should differ only in numerical parameters, such as the seed.
 
     Attributes:
         scenario: Scenario of one of the runs.
@@ -45,9 +45,9 @@ def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
     """Chooses the kinds of runs to compute side by side, and compiles the code for them.
 
     If the code has not been compiled before, a kind is chosen only if its runs are long enough
-    to make the compilation worthwhile. Kinds that cannot be computed side by side are chosen as
-    well if they are this long, or if other kinds in the study are computed side by side, so
-    that the study can report the reason.
+    in total to make the compilation worthwhile. A kind that cannot be computed side by side is
+    also chosen if its runs are just as long, or if another kind in the study is computed side
+    by side, so that the study can report the reason.
 
     Args:
         kinds: Kinds of runs, under arbitrary keys.

@@ -18,7 +18,9 @@ class StudyFolder(NamedTuple, Generic[P, J]):
     Attributes:
         path: Path of the folder.
         plan: Plan of the study.
-        facts: Plain values that identify the study, its arithmetic and the package versions.
+        facts: Plain values that must be the same when the study is continued: the
+            floating-point arithmetic of the machine, the package versions and, for a sweep, the
+            plan.
         remedy: Advice for the error message if the disk is full.
         journal: Function that opens the journal.
     """

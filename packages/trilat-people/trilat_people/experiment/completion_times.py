@@ -70,7 +70,7 @@ class CompletionComparison(NamedTuple):
     Attributes:
         first: Name of the first condition.
         second: Name of the second condition.
-        number: Number of units (participants or pairs) that have both conditions.
+        number: Number of units (participants or pairs) with trials under both conditions.
         longer: Number of units whose median was longer under the second condition.
         shorter: Number of units whose median was shorter under the second condition. The
             remaining units are ties, for example because neither median was reached.
@@ -227,8 +227,8 @@ def compare_times(
     """Compares the completion times of each pair of conditions by sign tests.
 
     The comparison is made within each unit (a participant, or a pair of participants), based on
-    which condition has the longer median. A median that was not reached is longer than any
-    median that was. Two medians that were not reached are tied.
+    which condition has the longer median. A median that was not reached counts as longer than
+    any median that was reached. Two medians that were not reached count as tied.
 
     Args:
         rows: Trials, as for `find_unit_medians`.

@@ -138,9 +138,9 @@ class ExperimentAnalysis(Result):
 
     Attributes:
         unit: The independently sampled unit, "participant" or "pair".
-        rows: Table of evaluated trials. If there is a training, only trials after it are
-            included.
-        learning_rows: Table of evaluated trials in all phases of a training.
+        rows: Table of evaluated trials. If the experiment includes training, only trials of the
+            phase "after" (directly after the training) are included.
+        learning_rows: Table of the evaluated trials of all phases.
         throughput_rows: Throughput (a combined measure of speed and accuracy) by unit and
             condition.
         gain_rows: Improvement through training, by unit and condition.
@@ -450,8 +450,9 @@ class ExperimentAnalysis(Result):
     def _is_censored(self, measure: str) -> bool:
         """Returns True if a measure is the completion time and some trials were not completed.
 
-        Unlike `_has_censored_times`, considers all phases of a training. The result determines
-        whether means or medians are computed.
+        Unlike `_has_censored_times`, considers the trials of all phases, not only those
+        directly after the training. The result determines whether means or medians are
+        computed.
 
         Args:
             measure: Name of a measure.

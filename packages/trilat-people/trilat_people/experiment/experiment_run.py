@@ -49,13 +49,13 @@ class Note(msgspec.Struct, frozen=True):
     of their own.
 
     Attributes:
-        cell: Unique key of the note, composed of the step of the experiment and the
-            participant, or of the aborted trial.
+        cell: Unique key of the note. The key names the step of the experiment and the
+            participant or, for an aborted trial, the attempt at the trial.
         kind: "consent", "questionnaire" or "aborted".
         who: Pseudonym of the participant. For an aborted trial, the pseudonyms of all its
             participants.
         number: Number of the trial to which the note belongs.
-        unix_s: Time of day on this machine's clock, in s since 1970.
+        unix_s: Unix time of the note on this machine's clock, in s.
         text: Name of the questionnaire, or the reason why the trial was aborted.
         answers: Mapping from item to answer; `None` for a missing answer.
         seed: Always 0. Present because journal entries of other studies have a seed.

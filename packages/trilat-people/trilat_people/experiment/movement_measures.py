@@ -108,8 +108,8 @@ def sparc(
 ) -> float | None:
     """Computes the spectral arc length (SPARC), a measure of the smoothness of a movement.
 
-    The value is negative, and closer to 0 for a smoother movement. An unsmooth movement has a
-    bumpy speed spectrum, whose curve is long.
+    The value is negative, and closer to 0 for a smoother movement. The speed spectrum of a
+    jerky movement has more bumps, so the curve of the spectrum is longer.
 
     Args:
         speed: Speed from the start to the end of the movement, in m/s or rad/s, shape (K,).
@@ -221,7 +221,7 @@ A range of this width contains 96 % of normally distributed end points.
 
 
 class Throughput(NamedTuple):
-    """Throughput of a sequence of movements to targets of equal distance and width.
+    """Throughput of a sequence of movements to targets of the same width at the same distance.
 
     Throughput is a combined measure of the speed and accuracy of aimed movements.
 

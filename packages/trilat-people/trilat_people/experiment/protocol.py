@@ -94,10 +94,10 @@ class _Training(Frozen, frozen=True):
     def describe(self) -> str:
         """Describes the design of the training in one sentence, for use in a paper.
 
-        In a training, an expert initially leads the slave, and authority gradually passes to
-        the learner. The sentence states the first and last value of the expert's share, as in
-        "0.9 to 0.1 (guided)", and the number of trials before and after the training and for
-        retention.
+        During the training, an expert initially leads the slave, and authority gradually passes
+        to the learner. The sentence states the first and last values of the expert's share, as
+        in "0.9 to 0.1 (guided)", and the numbers of trials before the training, after the
+        training and in the retention test.
         """
         courses: list[str] = []
         for condition, (first_lead, last_lead) in self.lead.items():
@@ -179,9 +179,9 @@ class ExperimentProtocol(Frozen, frozen=True):
     ) -> list[tuple[str, float | None]]:
         """Lists the phase and authority of each trial of a block, excluding practice trials.
 
-        A block contains all trials of a participant under one condition. With a training, the
-        phases are "before", "training", "after" and "retention". With a staircase, trials come
-        in pairs, one of which is the standard trial.
+        A block contains all trials of a participant under one condition. If the experiment
+        includes training, the phases are "before", "training", "after" and "retention". If it
+        includes a staircase, trials come in pairs of a standard trial and a comparison trial.
 
         Args:
             condition: Name of the condition of the block.
@@ -189,8 +189,8 @@ class ExperimentProtocol(Frozen, frozen=True):
 
         Returns:
             For each trial, the phase and the first user's share of the authority over the slave
-            arm, between 0 and 1. The phase is empty if there is neither training nor staircase.
-            If the share is `None`, the authority defined in the scenario is kept.
+            arm, between 0 and 1. The phase is empty if there is neither training nor a
+            staircase. If the share is `None`, the authority defined in the scenario is kept.
         """
         phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
@@ -378,10 +378,10 @@ class PlannedTrial(NamedTuple):
         seed: Random seed of the trial.
         catch: True for a catch trial, whose condition differs from that of its block. Excluded
             from the analysis.
-        phase: "before", "training", "after" or "retention" in a training; "standard" or
-            "comparison" in a staircase; otherwise empty.
-        lead: First user's share of the authority that both users have over the slave. If
-            `None`, the scenario's dominance factors are kept.
+        phase: "before", "training", "after" or "retention" in an experiment with training;
+            "standard" or "comparison" in an experiment with a staircase; otherwise empty.
+        lead: First user's share of the two users' combined authority over the slave. If `None`,
+            the scenario's dominance factors are kept.
     """
 
     number: int
@@ -586,8 +586,9 @@ class ExperimentPlan(Result):
     def rest_before_s(self, planned: PlannedTrial) -> float:
         """Returns the minimum rest of the participants before a trial, in s.
 
-        Participants rest before the first trial of each block but the first, and before the
-        retention test of a training. The rest is 0 before all other trials.
+        Participants rest before the first trial of every block except the first block, and
+        before the retention test that follows the training. The rest is 0 before all other
+        trials.
 
         Args:
             planned: The planned trial.

@@ -268,7 +268,7 @@ class Comparison(NamedTuple):
         measure: Name of the measure.
         first: Name of the first condition.
         second: Name of the second condition.
-        number: Number of units that have both conditions.
+        number: Number of units with values under both conditions.
         difference: Mean of the difference second minus first.
         interval: 95 % confidence interval of the difference from Student's t distribution.
         t: Statistic of the paired test, with number - 1 degrees of freedom. `None` if all
@@ -438,8 +438,8 @@ class MixedModel(NamedTuple):
         reference: The first condition, to which the others are compared.
         effects: Effect of each other condition.
         freedom: Degrees of freedom of t: number of observations minus number of participants
-            minus number of effects. Equal to those of an analysis of variance if all
-            participants have all conditions.
+            minus number of effects. Equal to those of an analysis of variance if every
+            participant has a mean under every condition.
         variances: Variances of "pair", of "participant" (within a pair) and of "residual".
         notes: Warnings from the fit, for example about a variance of 0.
     """
@@ -722,7 +722,7 @@ def simulate_power(
         number: Number of participants.
         trial_deviation: Standard deviation between trials.
         trials: Number of trials per participant and condition.
-        effect_deviation: Standard deviation between participants of the effect of a condition.
+        effect_deviation: Standard deviation of a condition's effect across participants.
         alpha: Significance level of the tests.
         repetitions: Number of simulated experiments.
         seed: Random seed.

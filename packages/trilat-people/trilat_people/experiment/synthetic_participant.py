@@ -49,8 +49,8 @@ class ParticipantModel(Frozen, frozen=True):
         fitts_b_s: Additional duration per bit of the index of difficulty, in s.
         noise: Standard deviation of a movement's end point, as a fraction of the movement's
             length.
-        crossover_rad_s: Rate at which a moving target is followed in the absence of delay, in
-            rad/s.
+        crossover_rad_s: Crossover frequency at which the participant follows a moving target in
+            the absence of delay, in rad/s.
         learning: Fraction by which the first trial is slower than a practised one.
         practised: Number of trials after which the fraction `learning` has halved.
         spread: Standard deviation of the logarithms of a participant's parameters.
@@ -69,7 +69,7 @@ class ParticipantModel(Frozen, frozen=True):
         """Draws the parameters of an individual participant around these mean parameters.
 
         Multiplies five parameters by log-normal factors with the deviation `spread`: the
-        reaction time, both constants of Fitts' law, the noise and the crossover frequency.
+        reaction time, both constants of Fitts's law, the noise and the crossover frequency.
 
         Args:
             seed: Random seed. Equal seeds give the same participant.
@@ -135,7 +135,7 @@ class SyntheticParticipant:
         self._moved_s = 0.0
 
     def act(self, now: HandView) -> Array:
-        """Decides where the participant currently moves the arm.
+        """Decides where the participant moves the arm next.
 
         The participant sees the slave arm and the target with a delay, and starts a new
         movement when the slave is at rest outside the target.

@@ -98,12 +98,13 @@ class TrialGoal:
         width_m: Diameter of the target, in m.
 
     Attributes:
-        start_m: Position of the target before it appears (the slave's start position), in m.
+        start_m: Start position of the slave's end effector, in m, which is used as the target
+            position until the target appears.
         width_m: Diameter of the target, in m.
         appears_s: Time at which the target appears, in s. Users must wait for it.
         is_moving: True if the target moves after appearing.
         force_n: Force to apply, in N, or 0 if the task does not require a force.
-        lead: First user's share of the authority that both users have over the slave, until a
+        lead: First user's share of the two users' combined authority over the slave, until a
             handover. If `None`, the scenario's dominance factors apply.
         handover: Time from the appearance of the target until authority passes to the second
             user, and duration of the transition, both in s. `None` if there is no handover.
@@ -137,7 +138,7 @@ class TrialGoal:
     def judge(self, t_s: float, position_m: Array, force_n: float = 0.0) -> "Outcome | None":
         """Decides whether the trial ends now.
 
-        A trial is judged from the appearance of the target on.
+        Before the target appears, the trial always continues.
 
         Args:
             t_s: Time since the start of the session, in s.
@@ -238,7 +239,7 @@ class Outcome(NamedTuple):
 class ReachTrial(_TrialTask, frozen=True, tag="reach"):
     """Task: move the arm to targets on a ring, as in ISO 9241-411.
 
-    Each target is opposite the previous one.
+    Each target is nearly opposite the previous one.
 
     Attributes:
         targets: Number of targets.
@@ -247,7 +248,7 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
         dwell_s: Time that the end effector must stay in the target, in s.
         timeout_s: Time limit of a trial, in s.
         corridor_m: Width of the straight corridor to the target, which the users must not
-            leave, in m. `None` if the path is free.
+            leave, in m. `None` if the users may take any path.
         handover_s: Time after which authority passes from the first user to the second, in s.
             `None` if there is no handover.
         ramp_s: Duration of the handover, in s. The end effector must stay in the target during

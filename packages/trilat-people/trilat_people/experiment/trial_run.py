@@ -90,7 +90,8 @@ class TrialJudge:
         Args:
             t_s: Time since the start of the session, in s.
             q: Joint positions, in rad or m.
-            tau_x: Minus the torques of hands and environments ON the arm, in N m or N.
+            tau_x: Negative of the torques that hands and environments exert ON the arm, in N m
+                or N.
 
         Returns:
             The outcome once the trial has ended; `None` until then.
@@ -218,7 +219,7 @@ class ExperimentTrial:
 
             Args:
                 lead: First user's share of the authority over the slave, between 0 and 1. The
-                    second user has the rest.
+                    second user gets the rest.
             """
             first_share = sum_of_shares * lead
             second_share = sum_of_shares - first_share
@@ -249,7 +250,8 @@ class ExperimentTrial:
 
         Args:
             q: Joint positions, in rad or m.
-            tau_x: Minus the torques of hands and environments ON the arm, in N m or N.
+            tau_x: Negative of the torques that hands and environments exert ON the arm, in N m
+                or N.
         """
         forces_n = self._find_forces_n(np.array([q]), np.array([tau_x]))
         return float(forces_n[0])
@@ -261,7 +263,8 @@ class ExperimentTrial:
 
         Args:
             q: Joint positions in K records, in rad or m, shape (K, n).
-            tau_x: Minus the external torques ON the joints, in N m or N, same shape as `q`.
+            tau_x: Negative of the external torques that act ON the joints, in N m or N, same
+                shape as `q`.
 
         Returns:
             The magnitudes, shape (K,).
@@ -289,8 +292,8 @@ class ExperimentTrial:
     def settle(self, path: Path) -> TrialEntry:
         """Verifies the log of the trial and computes the result from it.
 
-        The run is repeated from the log, and the result is valid only if the records are
-        identical.
+        The run is computed again from the inputs in the log, and the result is valid only if
+        this gives the same records.
 
         Args:
             path: Path of the log.

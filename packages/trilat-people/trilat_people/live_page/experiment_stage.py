@@ -72,8 +72,8 @@ class TrialWatch:
     def over(self) -> bool:
         """True once the session of the trial can end.
 
-        After an abort, the session can end immediately. After the outcome, it continues for
-        `END_DELAY_NS`, so that the log contains the motion after the trial.
+        After an abort, the session can end immediately. Once the outcome is known, the session
+        continues for `END_DELAY_NS`, so that the log contains the motion after the trial.
         """
         if self.aborted:
             return True
@@ -153,7 +153,7 @@ class TrialWatch:
         return log_marks
 
     def describe(self, t_s: float, site: str) -> Json:
-        """Describes for a page the target that the participants must currently reach.
+        """Describes, for a page, the target that the participants must reach at a given time.
 
         Also states whether the target has appeared.
 

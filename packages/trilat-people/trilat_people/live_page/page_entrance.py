@@ -35,8 +35,8 @@ class Strangers:
     others with many silent connections.
 
     Args:
-        refused: Mapping from reason to number of refusals, to which connections closed here are
-            added.
+        refused: Mapping from reason to number of refusals, which also counts the connections
+            closed because there are too many.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
@@ -47,8 +47,8 @@ class Strangers:
     def add(self, connection: ServerConnection) -> None:
         """Adds a new connection, closing and counting the oldest one if there are too many.
 
-        The oldest connection has had the most time to prove its role, so a flood of connections
-        cannot block new ones.
+        The oldest connection has had the most time to prove its role. Closing it prevents a
+        flood of connections from blocking new ones.
 
         Args:
             connection: The new connection, whose role is not known yet.

@@ -103,7 +103,7 @@ class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """Request of a page to obtain or give up the right to move arms and change settings.
+    """Request from a page to obtain or give up the right to move arms and change settings.
 
     Attributes:
         want: True to request the right, False to give it up.
@@ -113,10 +113,10 @@ class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
 
 
 class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
-    """Reply of a page to another page that has asked for control of the session.
+    """Reply from a page to another page that has asked for control of the session.
 
     A page with control may move arms and change settings. The pages that currently hold an arm
-    must agree before another page may take part.
+    must agree before another page is given control.
 
     Attributes:
         page: Number of the page that asked.
@@ -128,14 +128,14 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """Request of a page to stop all arms immediately. Anybody may send it, even a watcher.
+    """Request from a page to stop all arms immediately. Anybody may send it, even a watcher.
 
     The session continues, and the arms rest until somebody releases them.
     """
 
 
 class _ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
-    """Request of a page to release stopped arms, or to reset arms after a fault.
+    """Request from a page to release stopped arms, or to reset arms after a fault.
 
     Attributes:
         order: "enable" to let stopped arms follow the other arms again, "reset" to clear
@@ -148,7 +148,7 @@ class _ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
 
 
 class _SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
-    """Request of a page to change the delay or other settings of a network link.
+    """Request from a page to change the delay or other settings of a network link.
 
     The command `trilat set` changes the same settings.
 
@@ -162,7 +162,7 @@ class _SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
 
 
 class _SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
-    """Request of a page to change the dominance factors of a site.
+    """Request from a page to change the dominance factors of a site.
 
     Attributes:
         site: Name of the site.
@@ -174,7 +174,7 @@ class _SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class _MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """Request of a page to mark the current moment in the log with an event.
+    """Request from a page to mark the current moment in the log with an event.
 
     Attributes:
         text: Label of the mark, for example "contact".
@@ -184,7 +184,7 @@ class _MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
 
 
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
-    """Request of a page to show or hide the ages of displayed poses on the pages of users.
+    """Request from a page to show or hide the ages of displayed poses on the pages of users.
 
     The age is the delay with which a user sees another arm over the network.
 
@@ -196,7 +196,7 @@ class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
 
 
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
-    """Request of a page to take hold of an arm, to move it, or to release it.
+    """Request from a page to take hold of an arm, to move it, or to release it.
 
     Attributes:
         site: Name of the site of the arm.
@@ -211,7 +211,7 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """Request of a page to end the session in an orderly way, so that its log is complete.
+    """Request from a page to end the session in an orderly way, so that its log is complete.
 
     Accepted only by sessions that were started together with their page.
     """
@@ -233,7 +233,7 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
-    """Request of a page to abort the running trial of an experiment and repeat it later.
+    """Request from a page to abort the running trial of an experiment and repeat it later.
 
     Attributes:
         why: The reason, for the journal of the experiment.
@@ -243,7 +243,7 @@ class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
 
 
 SiteOrder = _SetLink | _SetShares | _ReleaseArms | _MarkMoment
-"""Request of a page that `OrderDesk.accept` forwards to sites."""
+"""Request from a page that `OrderDesk.accept` forwards to sites."""
 StageMessage = DoStep | AbortTrial
 _ANY_MESSAGE = reduce(or_, PageMessage.__subclasses__())
 _DECODER = msgspec.json.Decoder(_ANY_MESSAGE)

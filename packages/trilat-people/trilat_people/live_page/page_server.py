@@ -286,7 +286,7 @@ class PageOptions:
         return context
 
     def check(self) -> None:
-        """Raises UsageError if the server cannot listen on the address, or it is insecure.
+        """Raises UsageError if the address is insecure or the server cannot listen on it.
 
         An address outside this machine must be encrypted, or declared as `insecure`.
 
@@ -886,7 +886,7 @@ class PageServer:
     def experimenters(self) -> set[_Page]:
         """Open web pages of experimenters.
 
-        Those that take part control the session.
+        Of these pages, those with `takes_part` set control the session.
         """
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 

@@ -153,14 +153,13 @@ class _ArmFrames:
         }
 
     def describe_pose(self, q: Array) -> Json:
-        """Computes the points between the links of the arm for the web pages that draw it.
+        """Computes the end points of the arm's links for the web pages that draw the arm.
 
         Args:
             q: Joint positions, in rad or m, shape (n,).
 
         Returns:
-            The points between the links in m and the joint positions, as JSON-compatible
-            values.
+            The end points of the links in m and the joint positions, as JSON-compatible values.
         """
         rows = q[np.newaxis]
         points_m = self._rows.joint_positions_m(rows)[0]
@@ -170,7 +169,7 @@ class _ArmFrames:
         }
 
     def describe_start(self) -> Json:
-        """Computes the points between the links of the arm before the first control period.
+        """Computes the end points of the arm's links before the first control period.
 
         Returns:
             The pose in the format of `describe_pose`, with tick -1 and no bodies.
@@ -192,9 +191,9 @@ class _ArmFrames:
             records: Records since the previous frame, the last of which is the current one.
 
         Returns:
-            The current state as JSON-compatible values, and four largest values: norm of the
-            synchronisation error, torque of a joint in N m, force of people in N, and force of
-            the walls in N.
+            The current state as JSON-compatible values, and the largest values of four
+            quantities: the norm of the synchronisation error, the torque of a joint in N m, the
+            force of people in N, and the force of the walls in N.
         """
         split = TorqueSplit.of_records(records, self._scenario)
         hand_force = self._compute_hand_force(records, split)
@@ -243,8 +242,8 @@ class _ArmFrames:
             records: Records since the previous frame. The reference in the last record is used.
 
         Returns:
-            Points in m: for joint positions, the points between the links of an arm in the
-                reference pose; for an end effector pose, a single point, shape (1, 3).
+            Points in m: for joint positions, the end points of the links of an arm in the
+            reference pose; for an end effector pose, a single point, shape (1, 3).
         """
         points_m: Array
         if self._model.shares_pose:

@@ -159,7 +159,7 @@ class SiteView:
 
         Returns:
             The alarm with its reason. `None` if there is no alarm, if the site has ended, or if
-            it has no alarms (`glides`).
+            its stale rule is not `glide`.
         """
         record = self.record
         if record is None or not self.glides or self.ended:
@@ -324,8 +324,8 @@ class SessionView:
     def session_silence_s(self) -> float:
         """Time since the last message of any running site, in s.
 
-        Shown by displays, since either the session or their own connection may be lost. 0 while
-        messages from any site arrive.
+        Displays show this time to warn that either the session or their own connection may be
+        lost. The time is 0 while messages from any site arrive.
         """
         silences_s: list[float] = []
         for site in self.sites.values():
@@ -394,10 +394,10 @@ class SessionView:
     def find_peer_ticks(
         self, site: str, tick: int, used: Mapping[str, int]
     ) -> Mapping[str, int]:
-        """Returns the ticks at which the user of a site sees the other arms.
+        """Returns the ticks of the poses in which the user of a site sees the other arms.
 
-        The user sees a peer at the tick of the sample that the site uses for its control law
-        or, if the scenario delays the picture further, at the tick of an earlier sample.
+        The pose of a peer is that of the sample that the site uses for its control law or, if
+        the scenario delays the picture further, that of an earlier sample.
 
         Args:
             site: Name of the user's site.

@@ -371,7 +371,7 @@ class TunedGains(msgspec.Struct, frozen=True):
     """Gains of a control law, tuned for one kind of scenario and one network round trip.
 
     The tuning tries `tried` candidates. Of those that come to rest at the pose of the task even
-    when delays grow by `TUNING_MARGIN`, it selects the one with the smallest error.
+    when delays grow by the factor `TUNING_MARGIN`, it selects the one with the smallest error.
 
     Attributes:
         form: Kind of scenario in which the law runs, a key of `BASES`.
@@ -473,9 +473,9 @@ def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
 def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     """Returns a digest of everything that determines the tuned gains of a law.
 
-    The digest covers the scenario, the motion under the law, the ranges in which the gains are
-    searched, and the tuning procedure. A different fingerprint on stored gains means that they
-    were tuned for another experiment or another version of the law.
+    The digest covers the scenario, the error and effort of the law in a test run, the ranges in
+    which the gains are searched, and the tuning procedure. A different fingerprint on stored
+    gains means that they were tuned for another experiment or another version of the law.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.

@@ -48,8 +48,8 @@ def name_run(key: str, to_s: float) -> str:
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
-        to_s: Duration of runs that are repeated over a longer time, in s, which becomes part of
-            the name. 0 for the first runs.
+        to_s: Duration of the runs, in s, if they repeat first runs over a longer time. It
+            becomes part of the name. 0 for the first runs.
     """
     return f"{key} to {to_s:g} s" if to_s else key
 
@@ -154,10 +154,10 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def masked(self) -> bool:
-        """True if the slave should touch a wall in this run but did not.
+        """True if the slave should have touched a wall in this run but did not.
 
-        Quantities of such a run describe free motion and would look better than those of a run
-        with contact, so they are not shown.
+        The quantities measured without contact describe free motion and would look better than
+        those of a run with contact, so they are not shown.
         """
         return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
 
@@ -232,9 +232,9 @@ class BenchCellResult(NamedTuple):
 
     @property
     def masked(self) -> bool:
-        """True if the slave arm should touch a wall but did not in at least one of the runs.
+        """True if the slave should have touched a wall but did not in at least one of the runs.
 
-        Quantities of such a cell are not shown, because they do not describe the task.
+        The quantities of the cell are then not shown, because they do not describe the task.
         """
         return any(run.masked for run in self.runs)
 
@@ -278,8 +278,8 @@ class BenchCellResult(NamedTuple):
 
         Returns:
             The mean, with its 95 % confidence interval if there are at least `LEAST_SEEDS`
-            runs. `None` if a run lacks the quantity, or if the slave should touch a wall but
-            did not in at least one run.
+            runs. `None` if a run lacks the quantity, or if the slave should have touched a wall
+            but did not in at least one run.
         """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:
@@ -293,7 +293,7 @@ class BenchResults(Result):
     """Results of the benchmark, or of part of it, for printing, export and search.
 
     Attributes:
-        plan: Plan of the suite.
+        plan: Plan of the benchmark.
         places: The results of all cells, in the order of the plan.
         runs: All runs, in the same order.
         alone: Maps each reason why runs were not computed side by side with others to the

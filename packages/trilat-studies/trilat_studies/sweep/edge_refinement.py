@@ -36,7 +36,8 @@ class EdgeRefinement:
     `find_next_cells` and passes the results to the next call, until no more cells are returned.
 
     Args:
-        plan: The sweep, whose `refine` is the number of halvings.
+        plan: The sweep. Its attribute `refine` is the number of times that the boxes along the
+            edge are halved.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
@@ -52,7 +53,8 @@ class EdgeRefinement:
         """Stores the results of the last round and returns the cells to simulate next.
 
         Args:
-            sides: Side of each cell that has run since the last call.
+            sides: Side of the edge on which each cell lies (see `choose_side`), for all cells
+                that have run since the last call.
 
         Returns:
             Numbers of the cells, in ascending order. Empty if the refinement is complete.
@@ -99,7 +101,7 @@ class EdgeRefinement:
 
         Args:
             stable: Number of stable runs of the cell.
-            decided: Number of runs that are stable or not stable.
+            decided: Number of runs that were judged either stable or not stable.
 
         Returns:
             One of the constants `STABLE`, `UNSTABLE` and `UNDECIDED`.

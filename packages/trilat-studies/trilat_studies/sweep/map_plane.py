@@ -101,8 +101,8 @@ class PlaneAxis(NamedTuple):
     def compute_borders(self) -> Array:
         """Returns the borders of the cells along the axis, halfway between the swept values.
 
-        If no value is negative, no border is negative either, because a delay of -100 ms, for
-        example, does not exist.
+        If no value is negative, no border is negative either, because a delay, for example,
+        cannot be -100 ms.
 
         Returns:
             Positions, shape (n + 1,) for n values.
@@ -121,7 +121,7 @@ class PlaneAxis(NamedTuple):
         return borders
 
     def keep_columns(self) -> FineColumns:
-        """Returns only the columns of the map, for theoretical lines with no points between."""
+        """Returns only the columns of the map, for theoretical lines with no other points."""
         count = len(self.values)
         return FineColumns(self.values, tuple(self.positions.tolist()), tuple(range(count)))
 
@@ -168,7 +168,8 @@ class PlaneAxis(NamedTuple):
         """Returns the axis values in the coarse grid with which a refined sweep begins.
 
         Args:
-            halvings: Number of halvings of the refined sweep. If 0, the whole axis is returned.
+            halvings: Number of times that the refined sweep halves its grid. If 0, the whole
+                axis is returned.
         """
         stride = 2**halvings
         last = len(self.values) - 1
@@ -219,7 +220,7 @@ class MapPanel(NamedTuple):
 
     @property
     def decided(self) -> RunCounts:
-        """Number of runs at each grid point that are stable or not stable, shape (y, x).
+        """Number of runs at each grid point judged either stable or not stable, shape (y, x).
 
         All other runs are undecided, for example because they were too short.
         """
@@ -307,7 +308,7 @@ class MapPlane(NamedTuple):
         x: Horizontal axis.
         y: Vertical axis.
         panels: One panel per setting of the axes that are not drawn.
-        halvings: Number of halvings of a sweep that ran only the grid points along the
+        halvings: For a refined sweep, the number of times that the grid was halved along the
             stability edge. 0 if all grid points have runs.
         is_linear: True if the exponents are roots of the linearised loop and nothing was
             simulated.
@@ -517,11 +518,11 @@ def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
 
 
 class StabilityEdge(NamedTuple):
-    """An edge between stable and unstable values of a parameter, located up to an interval.
+    """An edge between stable and unstable values of a parameter, located to within an interval.
 
     Attributes:
-        low: Largest decided value below the edge.
-        high: Smallest decided value above the edge.
+        low: Largest value below the edge at which stability was decided.
+        high: Smallest value above the edge at which stability was decided.
         stable_below: True if the values below the edge are stable, False if those above it are.
         sharp: True if there is no undecided value between `low` and `high`.
     """

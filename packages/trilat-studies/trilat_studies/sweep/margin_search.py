@@ -42,7 +42,9 @@ SCAN_POINTS = 9
 range.
 """
 MARGIN_TOLERANCE = 0.005
-"""Default for the largest width of an edge, as a fraction of its value."""
+"""Default for the largest width of the interval that contains an edge, as a fraction of the
+value.
+"""
 _MAX_HALVINGS = 60
 """Maximum number of bisection steps."""
 
@@ -53,9 +55,9 @@ not, and `None` if it is undecided.
 
 
 class KeyMargin(NamedTuple):
-    """Stability edges along one scenario key, found by running selected values of the key.
+    """Stability edges along one scenario key, found by runs at selected values.
 
-    At an edge, neighbouring values change from stable to not stable or back.
+    At an edge, runs at neighbouring values change from stable to not stable or back.
 
     Attributes:
         spans: The edges in ascending order. There may be several, for example if stability is
@@ -63,7 +65,7 @@ class KeyMargin(NamedTuple):
         stable: If there are no edges, True if all decided values are stable, and False if no
             value is stable. `None` if there are edges, or if no value was decided.
         undecided: Number of values at which the stability of the run remained undecided.
-        runs: Number of values that were run.
+        runs: Number of values at which the scenario was run.
     """
 
     spans: tuple[StabilityEdge, ...]
@@ -138,7 +140,7 @@ def _narrow_edge(
         classify: Returns whether a value is stable.
         low: Decided value below the edge.
         high: Decided value above the edge, with the opposite result.
-        tolerance: Largest width of the edge, as a fraction of its value.
+        tolerance: Largest width of the interval, as a fraction of the value.
         whole: True if only integers can be run.
     """
     low_stable = classify(low)
@@ -195,7 +197,8 @@ class SearchRange(NamedTuple):
         key: Scenario key along which edges are searched for.
         low: Lower end of the range.
         high: Upper end of the range.
-        tolerance: Largest width of an edge, as a fraction of its value.
+        tolerance: Largest width of the interval that contains an edge, as a fraction of the
+            value.
     """
 
     key: str
@@ -218,7 +221,8 @@ class SearchRange(NamedTuple):
 
         Args:
             text: String of the form KEY=FROM:TO.
-            tolerance: Largest width of an edge, as a fraction of its value.
+            tolerance: Largest width of the interval that contains an edge, as a fraction of the
+                value.
 
         Raises:
             UsageError: The text does not have this form, or the tolerance is not within (0, 1).
@@ -303,7 +307,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
         The edges from runs, from the linear analysis, and from a closed-form criterion.
 
     Raises:
-        ScenarioError: The scenario is not valid at a value of the range.
+        ScenarioError: The scenario is not valid at a value in the range.
     """
     key, low, high, tolerance = task.range
 
@@ -395,7 +399,7 @@ class SweepMargins(Result):
             on: Workers to use instead of processes on this computer.
 
         Raises:
-            ScenarioError: The scenario is not valid at a value of the range.
+            ScenarioError: The scenario is not valid at a value in the range.
             RunFailed: A worker process died.
         """
         searches = []

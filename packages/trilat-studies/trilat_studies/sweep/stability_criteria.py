@@ -30,7 +30,8 @@ class StabilityCriterion(NamedTuple):
     delay.
 
     Attributes:
-        symbol: Equation of the limit of the condition, in TeX, for the legend of a figure.
+        symbol: Equation that holds where the condition is only just met, in TeX, for the legend
+            of a figure.
         text: The same equation as plain text.
         source: Origin of the condition, and whether it is necessary or sufficient.
         excess: Difference between the two sides of the inequality, in their unit. Positive if

@@ -45,7 +45,7 @@ _NO_COLUMNS: Array = np.zeros((0, 0))
 class MapLine(NamedTuple):
     """A line on a stability map that separates stable from unstable parameters.
 
-    The line is the zero of a quantity that is known at the grid points and interpolated
+    The line is the zero contour of a quantity that is known at the grid points and interpolated
     linearly between neighbouring grid points with the same x.
 
     Attributes:
@@ -79,7 +79,7 @@ class MapLine(NamedTuple):
         return self.fine_excess if self.fine_positions else self.excess
 
     def thin_out(self, columns: FineColumns) -> "MapLine":
-        """Splits a theoretical line into the map's columns and the fine columns in between.
+        """Separates a theoretical line's values at the map's columns from those at all columns.
 
         Args:
             columns: The columns at which the line was computed.
