@@ -1,4 +1,4 @@
-"""Finds the time after which the network delays and the tick periods of all arms repeat.
+"""Finds the time after which the network delays and the ticks of all arms repeat.
 
 A stability analysis of a loop with changing delays covers one such period. For example, two
 sinusoidal delays with periods of 1.20 s and 1.21 s repeat together after 145.2 s, their least
@@ -86,7 +86,7 @@ def _find_near_period_s(
 
 
 class DelayPeriod(NamedTuple):
-    """The time after which all network delays and tick periods repeat together.
+    """The time after which the pattern of all network delays and ticks repeats.
 
     For example, a delay that alternates every 20 ms repeats after 40 ms. The exact stability
     analysis of a sampled loop requires such a period.
@@ -137,9 +137,9 @@ class DelayPeriod(NamedTuple):
 
     @classmethod
     def of_scenario(cls, scenario: Scenario) -> "DelayPeriod":
-        """Finds the time after which all delays and tick periods repeat at the end of a run.
+        """Finds the time after which the delays and ticks at the end of a run repeat.
 
-        Delay models and rates that the scenario replaces before the end are ignored.
+        Delay models that the scenario replaces before the end are ignored.
 
         Args:
             scenario: The scenario.

@@ -131,8 +131,8 @@ class _FileInventory:
         """Describes the messages in each channel (topic) of the files, for `trilat log info`.
 
         Args:
-            log: The files opened as a log, whose missing messages are then counted, or `None`
-                if they are not a log.
+            log: The log that the files contain, or `None` if they are not a log. Missing
+                messages are counted only in a log.
 
         Returns:
             A mapping from topic to plain values.
@@ -240,9 +240,9 @@ class FileOverview(Result):
 
 
 def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
-    """Returns the content of an MCAP file, or of the parts of one log.
+    """Returns an overview of an MCAP file, or of the parts of one log.
 
-    `trilat log info` shows the same content. The key `kind` is "trilat" for a log of this
+    `trilat log info` shows the same overview. The key `kind` is "trilat" for a log of this
     program that could be opened, and "mcap" otherwise. If the file looks like a log of this
     program but cannot be opened, `problem` states why.
 

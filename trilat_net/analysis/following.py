@@ -72,9 +72,9 @@ def find_task_reference(
 class JointFollowing(NamedTuple):
     """Converts errors to motion and torque for a site that follows joint by joint.
 
-    Its coordinates are the joint angles, so every method merely multiplies by a gain, or
-    returns its input. `TaskFollowing` has the same methods for sites that follow with the end
-    effector. In all methods, `rows` selects the K rows of the records to evaluate.
+    Its coordinates are the joint angles, so its methods do no more than multiply by a gain.
+    `TaskFollowing` has the same methods for sites that follow with the end effector. In all
+    methods, `rows` selects the K rows of the records to evaluate.
 
     Attributes:
         Lambda: Gain of the synchronisation error e, shape (n,), in 1/s.
@@ -139,9 +139,9 @@ class JointFollowing(NamedTuple):
         rows: Rows,  # noqa: ARG002
         e: Array,
     ) -> tuple[Array, Array]:
-        """Returns two arrays of zeros, because no motion is damped near singular poses here.
+        """Returns two arrays of zeros, because following joint by joint needs no damping.
 
-        Singular poses matter only to arms that follow with their end effectors (see
+        Only arms that follow with their end effectors are damped near singular poses (see
         `TaskFollowing`).
 
         Args:

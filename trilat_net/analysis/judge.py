@@ -65,7 +65,7 @@ def certify_run(
     own_laws: bool = False,
     twins: int | None = None,
 ) -> Certificate:
-    """Certifies whether a recorded run was stable, using all available checks.
+    """Judges whether a recorded run was stable, using all available checks.
 
     In addition to the checks of `Certificate.of_log`, the run is repeated with small pushes,
     which shows whether disturbances grow. The characteristic roots of the coupled arms are
@@ -75,8 +75,8 @@ def certify_run(
         log: The log of the run.
         min_coverage: Smallest acceptable fraction of recorded ticks at each site.
         own_laws: True if the code of users' control laws may be executed.
-        twins: Number of repeated runs with a push. `None` for one push per joint, 0 for no
-            repetition.
+        twins: Number of repeated runs with a push: `None` for enough to push each joint
+            (`Push.choose`), 0 for none.
 
     Raises:
         LogError: A record cannot be read, or contains an invalid change.
@@ -145,9 +145,9 @@ class VirtualRun:
     @cached_property
     @limit_blas_threads()
     def twins(self) -> TwinGrowth | None:
-        """How small pushes in repeated runs develop, one per joint.
+        """How the effects of small pushes in repeated runs develop.
 
-        `None` if the roots decide without them.
+        The pushes are those of `Push.choose`. `None` if the roots decide without them.
         """
         if self._findings.is_decided_by_roots:
             return None
@@ -163,12 +163,12 @@ class VirtualRun:
     @cached_property
     @limit_blas_threads()
     def decision(self) -> StabilityDecision:
-        """The decision whether the run is stable, as its certificate would make it.
+        """The decision on whether the run is stable, the same as in a certificate of the run.
 
-        The run is repeated with all its records only if it has settled or is open, if its laws
-        have an energy function V or declare energies, and if it has at most
-        `MAX_RECORDED_TICKS` ticks. Energies, which require the records, may prove that the run
-        is stable, or contradict that it settled.
+        The run is simulated again to record every tick only if the verdict would otherwise be
+        settled or open, if its laws have an energy function V or declare energies, and if it
+        has at most `MAX_RECORDED_TICKS` ticks. The energies, which require the records, may
+        prove that the run is stable, or contradict the verdict that it settled.
         """
         scenario = self._scenario
         decision = self._findings._replace(twins=self.twins).decide()

@@ -65,7 +65,7 @@ class _PredictedDelivery(NamedTuple):
     def drawn_ms(self) -> Array:
         """Delays that the delay model of the scenario adds to the samples, in ms.
 
-        Samples that the model loses, and samples that have only the delay of the real network,
+        Samples that the model drops, and samples that have only the delay of the real network,
         are excluded. The effects of duplicates, reordering and the play-out buffer are not
         included.
         """
@@ -380,7 +380,7 @@ class ClockSummary(NamedTuple):
     def shared(self) -> bool:
         """True if sender and receiver run on the same machine and thus read the same clock.
 
-        Reports on a link then omit its clock, because no offset had to be estimated.
+        Reports on the link then omit the clock offset, because it did not have to be estimated.
         """
         return self.bound_max_us == 0 and self.offset_us == 0
 
@@ -473,9 +473,11 @@ class LinkSummary(NamedTuple):
         ages: Histogram of the effective delay.
         first_use_s: When the first sample came into use, in s.
         ticks_without_new: Fraction of the ticks at which no new sample came into use.
-        silence_ms: Longest time between two new samples in use, in ms.
+        silence_ms: Longest time after the first use in which no new sample came into use, in
+            ms.
         counts: Counts of samples.
-        loss: Fraction of the judged samples that could not come into use.
+        loss: Fraction of the judged samples that did not arrive, or that the emulated network
+            lost.
         burst: Mean number of consecutive samples that were lost together.
         one_way_us: Statistics of the measured one-way delays, in microseconds.
     """

@@ -91,8 +91,9 @@ MIN_SIGN_CHANGES = 6
 class Stability(StrEnum):
     """The four verdicts on a run. The value of each member is the word that users read.
 
-    STABLE requires a proof that the run does not contradict. SETTLED means that the motion
-    became slow or decays, without a proof. OPEN means that the findings do not decide.
+    STABLE requires a proof, and a run that does not contradict the proof. SETTLED means that
+    the motion became slow or decays, without a proof. OPEN means that the findings are
+    inconclusive.
     """
 
     STABLE = "stable"
@@ -176,8 +177,7 @@ class RunEnd(NamedTuple):
             Empty if the joint is not known.
         end_speed_where: Name of the joint with this |qd|. Empty if the joint is not known.
         where: Name of the worst joint. Empty if there are no records.
-        doubts: Findings that leave the stability of the run open. Empty if the stability is
-            decided.
+        doubts: Findings that leave the stability of the run open. Empty if there are none.
         operator_acts: True if an operator changes its action in the judged part, instead of
             only holding an arm.
         diverged_at_s: When the first site exceeded its limits, in s, or `None` if no site did.
@@ -241,7 +241,7 @@ class RunEnd(NamedTuple):
     def reasons(self) -> tuple[str, ...]:
         """Sentences on why the stability of the run remains open, one per doubt.
 
-        Empty if the stability is decided. The package `presentation` generates the sentences.
+        Empty if there are no doubts. The package `presentation` generates the sentences.
         """
         return tuple(find_hook("list the sentences of a finding")(self))
 
@@ -249,8 +249,9 @@ class RunEnd(NamedTuple):
     def of_log(cls, log: Log) -> "RunEnd":
         """Judges from a log whether the motion of the arms decayed at the end of the run.
 
-        If the log is truncated or empty, the end is undecided. If the run ends in a bounded
-        oscillation, its frequency is also computed.
+        A truncated log is judged by the records that it contains. If the log is empty, the
+        behaviour is undecided. If the run ends in a bounded oscillation, its frequency is also
+        computed.
 
         Args:
             log: The log of the run.
@@ -711,7 +712,7 @@ def _find_fed_joints(
     Args:
         joints: Trends at the end of all joints.
         site_of_joint: Index of each joint's site.
-        group: Indices of sites that follow each other.
+        group: Indices of coupled sites.
 
     Returns:
         Indices of these joints. Each is slower than some joint of the group whose speed falls.
@@ -889,10 +890,11 @@ def _count_sign_changes(values: Array) -> int:
 
 
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
-    """Groups the sites that follow each other at any time, directly or through other sites.
+    """Groups the sites that are coupled at any time, directly or through other sites.
 
-    Only sites of the same group are expected to agree at the end of a run. For example, m1, m2
-    and s form one group if s follows both masters.
+    Two sites are coupled if one of them follows the other. Only sites of the same group are
+    expected to agree at the end of a run. For example, m1, m2 and s form one group if s follows
+    both masters.
 
     Args:
         scenario: Scenario of the run, with the changes of its dominance factors.

@@ -83,7 +83,7 @@ class RunCircumstances(NamedTuple):
         large_pushes: The largest push at each site where it was a large fraction of the limit.
         late_ticks: Number of ticks that began late by a period or more, keyed by site.
         odd_age: Age of the samples in use on the link where it deviates most from the stated
-            delay, or `None` if every link agrees.
+            delay, or `None` if the ages agree with the delays on every link.
         program_sites: Sites whose arms were moved by a user's program. The verdict ignores how
             the program reacts to the arms.
         failures: Sentences from the log about programs that failed.
@@ -176,7 +176,8 @@ def _find_odd_age(log: Log) -> _OddAge | None:
     Links that change during the run are left out.
 
     Returns:
-        The age on the link with the largest difference. `None` if every link agrees.
+        The age on the link with the largest difference. `None` if the ages agree with the
+        delays on every link.
     """
     changed = {change.link for change in log.scenario.timeline}
     changed |= {change.link for change in Timeline(log).effective_commands}

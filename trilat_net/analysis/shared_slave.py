@@ -23,7 +23,7 @@ class UserShares(NamedTuple):
 
     The slave follows the master of each user with a dominance factor. For example, with shares
     of 0.7 and 0.3 the first user leads. In some experiments a program moves the arm of one
-    user. Whenever another user leads, a person intervenes.
+    user. Any other user who leads counts as a person who intervenes.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
@@ -38,7 +38,7 @@ class UserShares(NamedTuple):
 
 
 class SharedSlave:
-    """The slave arm that several users of a run control together, and these users.
+    """The slave arm that several users of a run control together, and the users' masters.
 
     Args:
         log: Log of the run.

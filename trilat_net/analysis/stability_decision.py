@@ -3,7 +3,8 @@
 The decision combines all evidence on a run:
 
 - how its motion ends, which `run_end` judges without any theory;
-- how small pushes in repeated runs (twins) develop, which `twin_growth` measures;
+- how the effects of small pushes in repeated runs (twins) develop, which `twin_growth`
+  measures;
 - proofs that hold for its control loop: the stability theorem with all its premises, the
   stability condition of a control law, or the characteristic roots of the loop.
 
@@ -11,7 +12,7 @@ The four verdicts are:
 
 - Stable: a proof exists for this loop, and the run does not contradict it.
 - Settled: the run became slow or its motion was decaying (`run_end` defines the limits), and
-  every push decayed, but there is no proof.
+  the effect of every push decayed, but there is no proof.
 - Not stable: the run diverged, oscillates, drifts or grows, or its loop has an exact root with
   a positive real part, and no proof contradicts this.
 - Open: everything else.
@@ -47,8 +48,8 @@ from .twins.envelope_trend import FLOOR_RAD, EnvelopeTrend
 from .twins.twin_growth import DOUBLES, TwinGrowth
 
 NEAR_REST_RAD = 0.02
-"""Largest distance of a run from a pose of rest at which unstable roots of that pose refute the
-run, in rad.
+"""Largest distance of a run from a pose of rest at which unstable roots of that pose show that
+the run is not stable, in rad.
 
 A run that is further away may come to rest in another pose, whose roots may be stable.
 """
@@ -97,7 +98,7 @@ Obstacle = Literal[
     "few bursts",
     "unclear end",
 ]
-"""Reasons that prevent a better decision.
+"""Reasons that prevent a better verdict.
 
 The first six are findings against stability: an arm exceeded its limits, there are doubts about
 the end of the run, sites have no records, delays repeat only after the judged part, other
@@ -131,7 +132,7 @@ class LoopRoots(NamedTuple):
         programs: Sites whose arms are moved by a user's program. The linearised loop omits how
             these programs react to the arms.
         is_numerical: True if the code of a user's law was differentiated numerically. Such
-            roots can refute a run, but not prove it stable.
+            roots can prove that small motions grow, but not that they decay.
         swing_rate_per_s: Largest real part of the computed roots that oscillate, in 1/s, or
             `None` if no computed root oscillates.
         omega_rad_s: Angular frequency of the root with the largest real part, in rad/s.
@@ -195,9 +196,8 @@ class LoopRoots(NamedTuple):
     def proven(self) -> str:
         """The verdict on small motions about the final pose that is proven by the roots.
 
-        The verdict is "stable" if the motions decay and "unstable" if they grow. Only exact
-        roots prove a verdict, which are those of a loop with its ticks and its repeating
-        delays. Empty if the roots are not exact.
+        The verdict is "stable" if the motions decay and "unstable" if they grow. Empty if the
+        roots are not exact (see `exact`), because only exact roots prove a verdict.
         """
         return self.verdict if self.exact else ""
 
@@ -212,20 +212,21 @@ class LoopRoots(NamedTuple):
         return self.proven == "unstable"
 
     def measure_decay_misfit(self, end: RunEnd) -> float:
-        """Measures how poorly the slow decay of the roots explains motion that seems to last.
+        """Measures how poorly a slow decay explains a motion that seems to last.
 
-        An oscillation is compared with the roots that oscillate, because another slow root does
-        not explain it. A drift is compared with the slowest root. The decay is compatible with
-        the motion in two cases: if the root halves the motion at most once in the judged part,
-        too little for a trend to show, or if |e| and |qd| have the rate of the root.
+        The roots predict the rate of the decay. An oscillation is compared with the roots that
+        oscillate, because another slow root does not explain it. A drift is compared with the
+        slowest root. The decay explains the motion in two cases: if it halves the motion at
+        most once in the judged part, too little for a trend to show, or if |e| and |qd| change
+        at the rate of the root.
 
         Args:
             end: How the motion ends.
 
         Returns:
-            A dimensionless misfit: at most 1 if the motion at the end may be the decay,
-                infinity if the roots are not numerical or not stable, or if the motion grows or
-                is not lasting.
+            A dimensionless misfit: at most 1 if the motion at the end may be the decay. It is
+                infinity if the roots are not stable or were not computed with numerical
+                derivatives, or if the motion grows or does not seem to last.
         """
         is_swing = end.behaviour is EndBehaviour.BOUNDED
         is_lasting = is_swing or end.behaviour is EndBehaviour.DRIFTS
@@ -270,7 +271,8 @@ class RunFindings(NamedTuple):
 
     Attributes:
         end: How the motion ends.
-        twins: How small pushes in repeated runs develop, or `None` if no run was repeated.
+        twins: How the effects of small pushes in repeated runs develop, or `None` if no run was
+            repeated.
         roots: Roots of the loop at the end of the run, or `None` if they were not computed.
         is_covered: True if the stability theorem proves the loop stable.
         law_proofs: Phrases that name the stability conditions of control laws that prove the
@@ -324,7 +326,7 @@ class RunFindings(NamedTuple):
 
     @property
     def is_decided_by_roots(self) -> bool:
-        """True if twins cannot change the decision and therefore need not be executed.
+        """True if twins cannot change the decision and therefore need not be simulated.
 
         This is the case if the run diverged, or if its exact roots and its end agree.
         """
@@ -374,7 +376,7 @@ class StabilityDecision(NamedTuple):
         stability: The decision.
         findings: The evidence.
         basis: Name of the evidence on which the decision is based.
-        obstacles: Names of the reasons that prevent a better decision. Empty if the run is
+        obstacles: Names of the reasons that prevent a better verdict. Empty if the run is
             stable.
         advised_s: Length of a run that would clearly show the decay of the slowest motion, in
             s, or `None` if no longer run is advised.
@@ -396,7 +398,7 @@ class StabilityDecision(NamedTuple):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on the reasons that prevent a better decision. Empty if the run is stable.
+        """Sentences on the reasons that prevent a better verdict. Empty if the run is stable.
 
         The package `presentation` generates them.
         """
@@ -410,7 +412,7 @@ class StabilityDecision(NamedTuple):
 
     @property
     def is_too_short(self) -> bool:
-        """True if only the length of the recording prevents a better decision."""
+        """True if only the length of the recording prevents a better verdict."""
         return "short record" in self.obstacles
 
 
@@ -495,7 +497,7 @@ def _confirms_slowest_root(run: RunFindings) -> bool:
     """Returns True if the slowest push decays at the rate that the slowest root predicts.
 
     A push is a small disturbance in a repetition of the run, and a root the growth rate of
-    small motions. In this case a push without a clear trend agrees with the roots: the push
+    small motions. In this case a push without a clear trend agrees with the roots: its effect
     merely decays slowly.
     """
     worst = None if run.twins is None else run.twins.worst
@@ -554,7 +556,7 @@ def _explain_open(run: RunFindings) -> Obstacle:
     """Returns why the stability of a run stays open although nothing contradicts it.
 
     Several reasons may apply. The first of them is returned, in the order from proofs that
-    disagree with the run to an end of the run that does not decide.
+    disagree with the run to an end of the run that is inconclusive.
 
     Args:
         run: Findings of the analyses on the run.

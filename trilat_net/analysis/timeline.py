@@ -322,7 +322,7 @@ class Timeline:
     def alarms(self) -> list[_RaisedAlarm]:
         """The alarms of all arms, ordered by their start.
 
-        If a person ordered an arm to stop, the reason of the alarm names this person.
+        If a person ordered an arm to stop, the reason for the alarm names this person.
 
         Raises:
             LogError: A record names an invalid change.

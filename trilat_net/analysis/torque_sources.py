@@ -234,8 +234,8 @@ class SourceRows:
 
         Args:
             hand: Recorded action of the operator (see `HandInForce`), shape (K, h): the
-                firmness of the grip from 0 to 1, two further values, the target and the
-                target's velocity.
+                firmness of the grip from 0 to 1, the numbers of the message and of its sender,
+                the target and the target's velocity.
             q: Joint angles, shape (K, n), in rad.
             qd: Joint velocities, shape (K, n), in rad/s.
             end_effector: Motion of the end effector.
@@ -272,8 +272,9 @@ class SourceRows:
     def compute_script(self, t_s: Array, J: Array) -> Array:
         """Returns an operator's plan as a torque that does not depend on the arm's motion.
 
-        Metrics use the plan to find out when the operator acts, because the plan changes if and
-        only if the operator moves. How the plan is defined depends on the kind of operator:
+        Metrics use the plan to find out when the operator acts, because the plan changes
+        whenever the operator's action changes, and only then. How the plan is defined depends
+        on the kind of operator:
 
         - Scripted torque (pulse, recorded, chirp, multisine): the torque itself.
         - Spring: K times the displacement of its target plus B times the target's speed. If the
@@ -454,11 +455,11 @@ class TorqueSplit(NamedTuple):
 
     @classmethod
     def with_script(cls, records: AlignedRecords, scenario: Scenario) -> "TorqueSplit":
-        """Splits the external torque on an arm between operator and environment, with the plan.
+        """Splits the external torque on an arm, and adds the plan of the operator.
 
-        The result also contains the torque that the scenario plans for the operator, if the
-        recorded torque agrees with it. If the scenario has no operator, rounding errors are
-        removed from the operator's torque.
+        The torque is split between operator and environment. The result also contains the
+        torque that the scenario plans for the operator, if the recorded torque agrees with it.
+        If the scenario has no operator, rounding errors are removed from the operator's torque.
 
         Args:
             records: Records of the site.

@@ -230,8 +230,7 @@ class RecordWindow:
 class EnergyCourse(NamedTuple):
     """The energy function V of the stability proof over one time span of a running session.
 
-    A live display plots V together with the supplied energy, the only amount by which V may
-    rise.
+    V may rise by no more than the supplied energy, so a live display plots the two together.
 
     Attributes:
         t_s: Times of the ticks of the site with the highest tick rate, shape (T,), in s.
@@ -258,11 +257,11 @@ class RunningEnergy:
     Attributes:
         windows: The newest records of every site, keyed by site name. The receiver of the
             records stores them here during the session.
-        missing: Sites whose law or arm has no energy function, grouped by reason. V cannot be
-            computed in that case.
+        missing: Sites whose law or arm has no energy function, grouped by reason. If there are
+            any, V cannot be computed.
         degrades: True if shares change when a peer is lost, in which case V is not computed.
-        closed_groups: Names of the sites in two groups that do not follow each other, in which
-            case V is not defined. Empty as long as there are none.
+        closed_groups: Names of the sites in two closed groups, which follow no site outside
+            their group. V is then not defined. Empty until two closed groups are found.
     """
 
     def __init__(self, scenario: Scenario, kept_s: float = KEPT_S) -> None:

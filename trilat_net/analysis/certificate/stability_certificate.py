@@ -68,7 +68,8 @@ class Certificate(Result):
         roots: Roots of the loop at the final pose of the run, or `None` if not computed.
         observed: Check of the energies that control laws declare, or `None` if no law declares
             any.
-        twins: Growth of small pushes in repeated runs, or `None` if not computed.
+        twins: Growth of the effects of small pushes in repeated runs, or `None` if not
+            computed.
         law_proofs: Phrases that name the stability conditions of control laws that hold at
             every site and prove that small motions decay. Empty if there are none.
         law_conditions: Sentences on the stability conditions of the control laws of the run.
@@ -181,7 +182,7 @@ class Certificate(Result):
         weight of an arm is zero if the arms that it follows do not follow it. The motion of
         such an arm is still bounded if the dominance factors are constant and the condition on
         these factors is the only one that fails. The arm then converges after the arms that it
-        follows.
+        follows have converged.
         """
         did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
         if self.balance is None or self.verdict.finding not in did_not_rise:
@@ -199,9 +200,9 @@ class Certificate(Result):
         modified log is never accepted.
 
         Args:
-            accepted: Further verdicts to accept: "settled" for a run that slowed down and in
-                whose repetitions all pushes decayed, "bounded" for a bounded oscillation,
-                "open" for a run that cannot be decided.
+            accepted: Further verdicts to accept: "settled" for a run that slowed down, and that
+                recovered from every small push when it was repeated, "bounded" for a bounded
+                oscillation, "open" for a run whose stability could not be determined.
         """
         if self.verdict.finding is StabilityFinding.BROKEN:
             return False
@@ -218,7 +219,7 @@ class Certificate(Result):
 
     @cached_property
     def decision(self) -> StabilityDecision:
-        """Whether the run is stable, with the evidence and the reasons against it.
+        """The decision on whether the run is stable, with the evidence for it.
 
         The decision combines the motion at the end, the repetitions with small pushes, the
         characteristic roots, the proofs and the doubts, according to the rules of
@@ -239,7 +240,8 @@ class Certificate(Result):
     def _is_covered(self) -> bool:
         """True if the stability theorem proves that the loop is stable.
 
-        All of its premises must hold, also after the run, and V must not have risen.
+        All of its premises must hold, constant delays must remain constant after the run, and V
+        must not have risen.
         """
         covered = self.verdict.finding is StabilityFinding.COVERED
         all_hold = all(premise.holds is True for premise in self.premises)
@@ -249,9 +251,9 @@ class Certificate(Result):
     def proofs(self) -> tuple[str, ...]:
         """Phrases that name the proofs for this loop, apart from its characteristic roots.
 
-        The stability theorem is a proof if all of its premises hold, even after the run, and V
-        did not rise. The stability condition of a control law is a proof if it holds at every
-        site.
+        The stability theorem is a proof if all of its premises hold, constant delays remain
+        constant after the run, and V did not rise. The stability condition of a control law is
+        a proof if it holds at every site.
         """
         if not self._is_covered:
             return self.law_proofs

@@ -42,15 +42,15 @@ class StabilityFinding(Enum):
 class FunctionalRise(NamedTuple):
     """Largest rise of the energy function V without energy supplied from outside.
 
-    V is the total energy of the arms in the stability proof, minus the work of operators and
-    walls. What remains must not rise.
+    Here V is the total energy of the arms in the stability proof, minus the work of operators
+    and walls. This difference must not rise.
 
     Attributes:
         from_s: When V was at its minimum before the rise, in s.
         at_s: When V was highest, in s.
         amount: Size of the rise, in J.
         causes: Energy that each source supplied during the rise, in J, in descending order.
-            Only sources of more than 5 % of the rise are listed.
+            Only sources that supplied more than 5 % of the rise are listed.
     """
 
     from_s: float
@@ -116,7 +116,7 @@ class UnclosedBalance(NamedTuple):
         error_j: Largest error, in J.
         scale_j: Largest energy of the run, in J.
         external: External arms, if only these are affected. Empty if the site is simulated.
-        is_certain: True if the records are certainly false. Otherwise, the cause may be a tick
+        is_certain: True if the records are certainly wrong. Otherwise, the cause may be a tick
             period that is too long for the gains.
     """
 
@@ -180,8 +180,8 @@ class FunctionalCourse(NamedTuple):
 
     Attributes:
         failed: Names of the premises that fail. If there are any, the theorem does not apply.
-        undecided: Quantities of the premises that the log does not decide.
-        external: Operators and environments that did work, named as in "hands".
+        undecided: Quantities of the premises for which the log does not show whether they hold.
+        external: Names of the external sources that did work, such as "hands" or "walls".
         from_s: First time at which V is known, in s.
         to_s: Last time at which V is known, in s.
         first_j: V at the first time, in J. 0 if V is only a rounding error.

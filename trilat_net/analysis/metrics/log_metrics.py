@@ -201,16 +201,17 @@ class LogMetrics(Result):
     def find_undelayed_maxima(
         log: Log, sites: Iterable[str], other: Log | None = None
     ) -> dict[str, float]:
-        """Finds the largest distance of each site from its peers at the same time.
+        """Finds the largest distance between each site and its peers at any one time.
 
         The tracking error compares a site with samples that its peers sent some time ago. This
-        distance, in contrast, includes the effect of the delay.
+        distance compares the site with its peers at the same time, and thus includes the effect
+        of the delay.
 
         Args:
             log: The log of the run.
             sites: Names of the sites.
-            other: Log of a run with the same sites, such as a rerun. If given, only times are
-                used at which this run also has a record of the site.
+            other: Log of a run with the same sites, such as a rerun. If given, only times at
+                which this run also has a record of the site are used.
 
         Returns:
             The largest distance by site, in rad, or in m if the sites share positions. Sites

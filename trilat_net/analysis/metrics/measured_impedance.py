@@ -75,7 +75,7 @@ class FrequencyResponse(NamedTuple):
         segments: Effective number of segments: the number of segments of equal power that would
             excite the line as much as all recorded segments do.
         error: Random error of the magnitude: one standard deviation, relative to the magnitude.
-        why: The reason why the ratio is undecided. Empty if it is decided.
+        why: The reason why the ratio could not be determined. Empty if it was determined.
     """
 
     frequency_hz: float | None = None

@@ -32,7 +32,7 @@ class Metric(NamedTuple):
         value: The finite value, or `None` if it is missing.
         why: The reason why the value is missing. Empty if it is not missing.
         applies: False if the quantity cannot exist for this subject in any run of this
-            scenario. In that case no information is missing.
+            scenario. A missing value is then to be expected.
     """
 
     value: float | None
@@ -172,7 +172,7 @@ class Quantity(NamedTuple):
     For example, the RMS error has the unit rad and applies to each arm.
 
     Attributes:
-        key: Key in programs. It ends in the unit if the quantity has a unit.
+        key: Key in tables and JSON output. It ends in the unit if the quantity has a unit.
         name: Name that users read.
         unit: Unit. Empty for a dimensionless number.
         reduction: How the value of the run is computed from those of its subjects: "max" or

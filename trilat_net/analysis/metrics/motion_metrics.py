@@ -109,7 +109,7 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
 
 @measures("site", UNDELAYED, *Quantity.list_shared(_UNDELAYED_ERRORS))
 def measure_undelayed_error(view: RunView, site: str, other: Log | None = None) -> MetricValues:
-    """Measures how far a site is from its peers at the same time.
+    """Measures how far a site is from where its peers are at the same time.
 
     The error e of a site compares its coordinates with those that its peers sent some time ago.
     The undelayed error compares them with the peers' coordinates at the same time t, weighted
@@ -124,7 +124,7 @@ def measure_undelayed_error(view: RunView, site: str, other: Log | None = None) 
         view: The run.
         site: Name of the site.
         other: Log of a run with the same sites, such as a rerun, which may end earlier. If
-            given, only times are used at which this run also has a record of the site.
+            given, only times at which this run also has a record of the site are used.
     """
     followed = _list_followed_peers(view, site)
     missing = [name for name in (site, *followed) if name not in view.sites]

@@ -329,9 +329,9 @@ class SharingRatio(NamedTuple):
         """Compares the torque that an operator feels with the torque on another arm.
 
         The comparison is made at every joint at which exactly two arms are loaded, while all
-        arms are at rest. Of the two operators, the one modelled as a spring feels the torque,
-        and the torque on the other arm is the cause. If both operators or neither are modelled
-        as springs, the operator of the master feels the torque.
+        arms are at rest. The operator modelled as a spring, at a site without an environment,
+        is taken to feel the torque that acts on the other arm. If this describes both sites or
+        neither, the operator of the master is taken to feel the torque.
 
         Args:
             view: The recorded run.

@@ -96,7 +96,7 @@ class _DelayInterval(NamedTuple):
 
         It names the ends of the interval of stable delays, and the frequency at which
         characteristic roots cross the imaginary axis at the upper end. It is empty if no roots
-        cross at either end, because all examined delays are then stable.
+        cross at either end, because the loop is then stable for all examined delays.
         """
         if self.low is None and self.high is None:
             return ""

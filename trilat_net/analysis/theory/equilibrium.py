@@ -398,7 +398,7 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
         scenario: The scenario.
         pose: Pose in which all arms are at rest: one angle per joint in rad, or in task space
             the pose of the end effectors. The estimates of the arm parameters are then assumed
-            to be true. If `None`, the equilibrium at the end of a run is used.
+            to be correct. If `None`, the equilibrium at the end of a run is used.
 
     Returns:
         The equilibrium, with remarks for the user.
@@ -437,7 +437,8 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
         scenario: The scenario.
 
     Raises:
-        ScenarioError: The scenario has no linear loop, or no equilibrium near the prediction.
+        ScenarioError: The scenario cannot be linearised, or has no equilibrium near the
+            prediction.
     """
     conditions = OperatingConditions.derive(scenario)
     return _require_equilibrium(scenario, _predict_from_start(conditions, scenario))
@@ -638,7 +639,7 @@ def _reach_pose(site: SiteSetup, pose: Array) -> Array:
 def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
     """Returns the mean of the start poses of all arms, shape (m,).
 
-    A pose consists of the joint angles, or in task space of the pose of the end effector.
+    The pose of an arm is given by its joint angles, or in task space by its end effector.
 
     Args:
         scenario: The scenario.

@@ -145,8 +145,8 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
         """Returns the contribution of the controller to the state of a site during one tick.
 
         The controller torque moves the arm, and the parameter estimates change. The torque of
-        this tick is kept for the next tick if the integration scheme needs it. All quantities
-        are linear.
+        this tick is kept for the next tick if the integration scheme needs it. The contribution
+        is linear in the arguments.
 
         Args:
             arguments: States and inputs of the site, in the order of `ArgumentLayout`, shape
@@ -214,8 +214,8 @@ def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
 class CoupledTicks(NamedTuple):
     """Linear model of all arms and their control loops over one tick.
 
-    The eigenvalues of the model show whether small motions grow. The n states belong to the
-    sites.
+    The eigenvalues of the model show whether small motions grow. Each of the n states belongs
+    to one of the sites.
 
     Attributes:
         S: Matrix that maps the states of all sites to their values at the next tick, excluding
@@ -332,8 +332,8 @@ class SamplesInUse(NamedTuple):
         """Finds which samples of the other sites each site uses, at every tick of a time span.
 
         The pattern of used samples repeats after some time, and the span consists of complete
-        repetitions. Random delays never repeat, and a span of fixed length with drawn delays is
-        used for them.
+        repetitions. For random delays, which never repeat, the span has a fixed length and its
+        delays are drawn.
 
         Args:
             conditions: The sites, their tick rates, and the links between them.
@@ -671,8 +671,9 @@ class _SpanMap:
         Args:
             V: Motions at the start of the span, shape (size, columns).
             divided: True to remove motions that stay constant, and to scale the columns after
-                each part.
-            sizes: List to which the norm of each column after each part is appended.
+                each part of the span.
+            sizes: List to which the norm of each column after each part of the span is
+                appended.
 
         Returns:
             The motions at the end of the span, shape (size, columns).
@@ -819,14 +820,15 @@ def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
 
 
 class SampledLoop:
-    """Linear model of coupled arms whose controllers act in ticks, for several equilibria.
+    """Linear model of coupled arms whose controllers act once per tick.
 
-    The modes about one equilibrium are a good starting point for the search for the modes about
-    another one nearby, which then takes half the time.
+    The model can be evaluated at several equilibria. The modes about one equilibrium are a good
+    starting point for the search for the modes about another one nearby, which then takes half
+    the time.
 
     Args:
-        conditions: The sites, gains and delays. All control laws must permit linearisation in
-            ticks.
+        conditions: The sites, gains and delays. All control laws must permit linearisation tick
+            by tick.
         uses: The samples of the other sites that each site uses. If `None`, they are derived
             from the links.
     """
@@ -851,8 +853,7 @@ class SampledLoop:
 
         Args:
             rest: The equilibrium about which the loop is linearised.
-            wanted: Number of roots. Fewer are returned if the others are too close to
-                -infinity.
+            wanted: Number of roots. Fewer are returned if all other motions decay far faster.
         """
         uses = self._uses
         span_s: float | None = uses.period_s or uses.span_s
@@ -907,7 +908,7 @@ class SampledLoop:
 
     @limit_blas_threads()
     def measure_rightmost_rate(self, pose: Equilibrium, scale_per_s: float) -> float | None:
-        """Computes how fast the fastest small motion about a pose grows, with limited accuracy.
+        """Computes the largest growth rate of small motions about a pose, to limited accuracy.
 
         Args:
             pose: The pose about which the loop is linearised.

@@ -54,7 +54,8 @@ class _FrequencyBand(NamedTuple):
 class Minima(NamedTuple):
     """A curve over frequency, sampled finely enough to resolve its minima.
 
-    An example is the smallest eigenvalue of a frequency response, whose negative bands matter.
+    An example is the smallest eigenvalue of a frequency response: a condition such as passivity
+    is violated where the eigenvalue is negative.
 
     Attributes:
         w_rad_s: Frequencies, shape (F,), in rad/s.
@@ -182,8 +183,8 @@ def refine_response(response: PortResponse, w_rad_s: Array) -> tuple[Array, Port
     imaginary axis, refinement stops when two points differ by a millionth.
 
     Several analyses evaluate the response at the refined frequencies. The returned response
-    therefore has cached values there. They are returned only when the function is called with
-    the very array of the refined frequencies.
+    therefore has cached values there. It uses them only if its argument is the same array
+    object as the returned frequencies.
 
     Args:
         response: The response as a function of frequency.

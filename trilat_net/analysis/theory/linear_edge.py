@@ -51,7 +51,10 @@ _LOGARITHMIC = 20.0
 A larger range is scanned in equal steps of the logarithm.
 """
 _LEAST_PER_S = -1e3
-"""Smallest growth rate in Brent's method, in 1/s, which replaces -infinity if nothing moves."""
+"""Smallest growth rate in Brent's method, in 1/s.
+
+It replaces -infinity, the growth rate if all roots are zero.
+"""
 _INTEGER_KEYS = ("rate_hz", "seed")
 
 ASSUMED_EQUILIBRIUM_REMARK = (
@@ -134,7 +137,7 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
         theta_hat: Estimates of the arms' P parameters in these states, shape (K, N, P).
 
     Returns:
-        The growth rate, -infinity if nothing moves, or NaN if no wall is touched or the
+        The growth rate, -infinity if all roots are zero, or NaN if no wall is touched or the
         scenario cannot be linearised.
     """
     deepest = find_deepest_contact(scenario, q)
@@ -180,8 +183,8 @@ class EdgeScan(NamedTuple):
         key: Key of the scenario, such as "control.d".
         low: Lower end of the scanned range.
         high: Upper end of the scanned range.
-        edges: The values in ascending order, with the roots that cross there. Empty before the
-            range was scanned.
+        edges: The values in ascending order, with the roots that cross there. Empty until the
+            range has been scanned.
     """
 
     key: str
@@ -245,7 +248,7 @@ def iterate_linear_edges(
             If `None`, this is chosen as described in the docstring of the module.
 
     Raises:
-        ScenarioError: A value is invalid for that key, or the scenario has no linear loop.
+        ScenarioError: A value is invalid for that key, or the scenario cannot be linearised.
         UsageError: The range is empty.
     """
     is_valid_range = np.isfinite([low, high]).all() and low < high and points >= 2
@@ -286,8 +289,8 @@ class _GrowthPoint(NamedTuple):
     def is_unstable(self) -> bool:
         """True if small motions of the arms grow at this value of the setting.
 
-        A stability limit lies between neighbouring values of which one is stable and the other
-        unstable.
+        A stability limit lies between two neighbouring values if the arms are stable at one of
+        them and unstable at the other.
         """
         return self.growth_per_s > 0.0
 
@@ -331,8 +334,8 @@ class _GrowthRate:
             value: Value of the setting, in its own unit.
 
         Returns:
-            The growth rate, in 1/s, which is negative if motions decay, and -infinity if there
-            are no moving modes.
+            The growth rate, in 1/s, which is negative if motions decay, and -infinity if all
+            roots are zero.
         """
         typed_value = round(value) if self.takes_integers else value
         scenario = load_scenario(self._scenario, {self._key: typed_value})
@@ -345,10 +348,10 @@ class _GrowthRate:
         return -np.inf if self._root is None else self._root.s.real
 
     def close_edge(self, left: _GrowthPoint, right: _GrowthPoint) -> LinearEdge:
-        """Locates the change between stable and unstable arms between two values of a setting.
+        """Locates the value of a setting at which the arms become stable or unstable.
 
-        Exactly one of the two values gives an unstable loop. Integer settings are searched by
-        bisection, all others with Brent's method.
+        The arms must be unstable at exactly one of the two values `left` and `right`. Integer
+        settings are searched by bisection, all others with Brent's method.
 
         Args:
             left: The smaller value, with its growth rate.
@@ -359,7 +362,8 @@ class _GrowthRate:
 
         Raises:
             ScenarioError: For a value in between, the scenario cannot be linearised.
-            ValueError: When evaluated again, both values are stable, or both are unstable.
+            ValueError: When evaluated again, the arms are stable at both values, or unstable at
+                both.
         """
         low = left.value
         high = right.value
@@ -392,9 +396,9 @@ class GrowthColumn(NamedTuple):
     Attributes:
         growth_per_s: Growth rate for each value, in 1/s: the real part of the rightmost
             characteristic root. It is NaN if the scenario cannot be linearised, and -infinity
-            if nothing moves.
-        edges: Values at which stability changes. The key n means that the change lies between
-            the values n and n + 1.
+            if all roots are zero.
+        edges: Values at which stability changes. The key n belongs to the change between the
+            evaluated values with the indices n and n + 1.
         remarks: Remarks for the user on the analysis, without repetition.
         is_sampled: True if the roots were computed from Floquet multipliers of the loop with
             its ticks, False if the loops were analysed in continuous time.
@@ -426,7 +430,8 @@ class GrowthColumn(NamedTuple):
             key: Name of the setting, such as "control.d".
             values: Values of the setting, one per scenario.
             at_mean_pose: True to linearise each scenario about the equilibrium nearest to the
-                mean of its start poses, with true estimates. No run is simulated in this case.
+                mean of its start poses, with correct estimates. No run is simulated in this
+                case.
 
         Returns:
             The growth rates, and the values at which stability changes. Such a value is missing
@@ -476,8 +481,8 @@ class GrowthColumn(NamedTuple):
         An example is the smallest damping gain with which the arms are stable.
 
         Args:
-            scenario: The scenario. The equilibrium is determined with its own value of the
-                setting.
+            scenario: The scenario. The equilibrium is determined with the value that the
+                scenario itself gives to the setting.
             key: Name of the setting, such as "control.d".
             low: Smallest value to examine.
             high: Largest value to examine.

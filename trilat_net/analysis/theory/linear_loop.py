@@ -615,7 +615,7 @@ def _replace_estimate(
     estimate = layout.estimate
 
     def convert(derivative: Array) -> Array:
-        """Converts a derivative with respect to the estimates to one with respect to z."""
+        """Converts derivatives by the estimates theta_hat to derivatives by z = T theta_hat."""
         motion = derivative[:, : estimate.start]
         by_estimate = derivative[:, estimate]
         by_z = by_estimate @ estimate_by_z

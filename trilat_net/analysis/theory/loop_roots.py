@@ -68,8 +68,8 @@ class EndLoop(NamedTuple):
     The loop is linearised about the equilibrium to decide whether small motions decay.
 
     Attributes:
-        scenario: The scenario up to the end of the run. Delays that only the run shows are
-            replaced by their mean.
+        scenario: The scenario up to the end of the run. Delays that are known only from the run
+            are replaced by their mean.
         conditions: The data from which the loop is built.
         rest: The equilibrium nearest to the end of the run.
         uses: The samples in use in the last quarter of the run, if delays are random or
@@ -212,12 +212,12 @@ def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
     """Decides by linear analysis whether small motions at the end of a recorded run decay.
 
     The coupled arms are linearised at the equilibrium nearest to the final pose. The result may
-    prove the run stable, or refute it.
+    prove that these motions decay, or that they grow.
 
     Args:
         log: The log of the run.
-        own_laws: True if the code of imported control laws may be executed. Otherwise a loop
-            with such a law has no roots.
+        own_laws: True if the code of imported control laws may be executed. Otherwise no roots
+            are computed for a loop with such a law.
 
     Returns:
         The roots of the final loop, or the reason why there are none.
@@ -273,8 +273,8 @@ class _FixedDelays(NamedTuple):
     A linear analysis needs known delays, but measured delays are known only after the run.
 
     Attributes:
-        scenario: The scenario up to the end of the run. A link whose delays only the records
-            show has its constant mean delay.
+        scenario: The scenario up to the end of the run. Delays that are known only from the run
+            are replaced by their mean.
         uses: The samples in use in the last quarter of the run. `None` if the scenario
             determines all delays, or if no sample was received over some link.
         mean_age_s: Mean age of the samples on links with unknown delays, in s, by (index of the

@@ -191,7 +191,7 @@ class OperatingConditions(NamedTuple):
         return any(actor.sampled for actor in actors)
 
     def evaluate_rates(self, arguments: Sequence[Array]) -> list[SiteRates]:
-        """Computes how fast the states of every arm change: accelerations and learning rates.
+        """Computes the accelerations of every arm and the rates of its parameter estimates.
 
         The states of an arm are its joint angles, its joint velocities and its parameter
         estimates.
@@ -251,7 +251,7 @@ class OperatingConditions(NamedTuple):
     def compute_shared_poses(self, rest: Equilibrium) -> list[Array]:
         """Computes the pose that each arm sends to the other arms while all arms are at rest.
 
-        The pose consists of the joint angles, or in task space of the pose of the end effector.
+        The pose of an arm is given by its joint angles, or in task space by its end effector.
 
         Args:
             rest: The equilibrium.
@@ -315,8 +315,8 @@ class OperatingConditions(NamedTuple):
             own_laws: True if the code of imported control laws may be executed.
 
         Raises:
-            ScenarioError: A law has no linear loop, an arm is not simulated, or the delay of a
-                link is measured during the run.
+            ScenarioError: A law cannot be linearised, an arm is not simulated, or the delay of
+                a link is measured during the run.
         """
         gains = _find_linear_gains(scenario, own_laws=own_laws)
         notes: list[str] = []
@@ -577,9 +577,9 @@ def compute_effective_delay(
 def has_lasting_delays(scenario: Scenario) -> bool:
     """Returns True if delays that are constant in a run remain constant after its end.
 
-    Delays do not remain constant if a sinusoid or a trace has other delays later. The ages of
-    samples are compared, because a play-out buffer may hide varying delays. Random and measured
-    delays are ignored, since only records show them.
+    Delays do not remain constant if a sinusoid or a trace prescribes other delays later. The
+    ages of samples are compared, because a play-out buffer may hide varying delays. Random and
+    measured delays are ignored, since only records show them.
 
     Args:
         scenario: The scenario, with the duration of the run.

@@ -144,8 +144,8 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
     """Computes the weights of the sites in the energy function of the stability proof.
 
     The weight of site i is beta_i = pi_i / c_i, where pi is the left eigenvector of the matrix
-    of dominance factors, and c_i the gain of site i relative to gains common to all sites. The
-    proof is in docs/theory/errata-proof.md.
+    of dominance factors, and c_i the ratio of the damping gain of site i to that of the first
+    site. The proof is in docs/theory/errata-proof.md.
 
     Args:
         conditions: The sites, gains and dominance factors.
@@ -195,12 +195,12 @@ class PortAnalysis(NamedTuple):
             edge".
         pole: Pole of the admittance at zero frequency.
         velocity: Passivity at all ports with respect to the velocities.
-        joints: Passivity at each single joint, without operators at the other joints, keyed by
-            joint number.
+        joints: Passivity at the same joint of every arm, without operators at the other joints,
+            keyed by joint number.
         proof: Passivity with respect to r = qd + Lambda e, or `None` if the law has no r.
         beta: Weights of the sites in `proof`, shape (N,), which sum to N.
-        estimates_true: True if all estimates at the equilibrium are true. Otherwise the proof
-            counts the energy that they store, which a linear loop cannot show.
+        estimates_true: True if all estimates at the equilibrium are correct. Otherwise the
+            proof counts the energy that they store, which a linear loop cannot show.
         absolute: Smallest eigenvalue over frequency with the best weights. If it is never
             negative, the loop is stable with any passive operators.
         two_ports: Llewellyn's criterion for every pair of sites.
@@ -306,9 +306,9 @@ class PortAnalysis(NamedTuple):
         Args:
             scenario: Scenario of the coupled arms.
             rest: The equilibrium.
-            of: Site whose arm is free in one case and clamped in the other, while operators
-                feel the other arms. If `None`, the slave is used, or the last site if there is
-                no slave.
+            of: Site whose arm is free in one case and clamped in the other, to compare what
+                operators feel at the other arms. If `None`, the slave is used, or the last site
+                if there is no slave.
             band_hz: Lower and upper end of the band, in Hz.
             hands: Measured impedances of operators. Any of them may hold the arm of any master.
 

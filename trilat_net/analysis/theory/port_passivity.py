@@ -129,7 +129,7 @@ class Passivity(NamedTuple):
             return find_least_eigenvalue(weighted)
 
         def find_tolerance(w: Array) -> Array:
-            """Returns the rounding error of the smallest eigenvalue at each w, in rad/s."""
+            """Returns the rounding error of the smallest eigenvalue at each frequency w."""
             Y = response(w)
             norm = _find_frobenius_norm(Y)
             return EIGENVALUE_ROUNDING * norm
@@ -232,7 +232,7 @@ def check_against_hands(
     held: Sequence[Sequence[HandMatrices]],
     places: Sequence[Array],
 ) -> Minima | None:
-    """Checks whether the loop is stable if any of the measured operators hold any end effector.
+    """Checks whether the loop is stable whichever measured operators hold the end effectors.
 
     The result is the smallest eigenvalue of Z + Z^H + 2 D over every choice of operators, where
     Z = Y^-1, and D is the resistance of the operators at the ports. If the eigenvalue is not
@@ -278,7 +278,7 @@ def check_against_hands(
         return least
 
     def find_tolerance(w: Array) -> Array:
-        """Returns the rounding error of the smallest eigenvalue at each w, in rad/s."""
+        """Returns the rounding error of the smallest eigenvalue at each frequency w."""
         Y = response(w)
         Z: Complex = np.linalg.inv(Y).astype(np.complex128)
         norm = _find_frobenius_norm(Z)
@@ -390,8 +390,9 @@ def llewellyn_parameter(Y: Complex) -> Array:
 def llewellyn_rounding(Y: Complex) -> Array:
     """Returns the rounding error of Llewellyn's stability parameter, shape (F,).
 
-    If the distance of the parameter from its limit is less than this error, the criterion does
-    not decide. The error is large if almost nothing is transmitted from one joint to the other.
+    If the distance of the parameter from its limit is less than this error, the criterion is
+    inconclusive. The error is large if almost nothing is transmitted from one joint to the
+    other.
 
     Args:
         Y: Admittance, shape (F, 2, 2).

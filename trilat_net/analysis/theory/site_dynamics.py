@@ -284,7 +284,7 @@ def _follow(
 def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
     """Returns the pose that an arm sends to the other arms.
 
-    The pose consists of the joint angles, or in task space of the pose of the end effector.
+    The pose of an arm is given by its joint angles, or in task space by its end effector.
 
     Args:
         site: Setup of the site.

@@ -1,4 +1,4 @@
-"""Compiled inner loop of the linear model in ticks, in which `floquet` spends most of its time.
+"""Compiled inner loop of the linear model over ticks, where `floquet` spends most of its time.
 
 A linear model of N sites computes the state of each site tick by tick from its own previous
 state and from samples of its peers. The matrices have about eight rows. At this size, calls to

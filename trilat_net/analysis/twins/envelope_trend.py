@@ -1,7 +1,7 @@
 """Decides whether an oscillation grows, decays or persists, over the second half of a run.
 
 The envelope of a signal is its largest magnitude in each short time interval. The second half
-of the run is divided into 16 equal windows, or into 8 windows if 16 do not decide. The maximum
+of the run is divided into 16 equal windows, or into 8 if 16 show no clear trend. The maximum
 of each window, at least `FLOOR_RAD`, is taken, and a straight line is fitted to the logarithms
 of these maxima. Its slope has one-sided confidence bounds of 99.5 % (Student's t).
 
@@ -102,8 +102,8 @@ class EnvelopeFit(NamedTuple):
 
         Args:
             t_s: Times in ascending order, shape (K,), in s.
-            values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in
-                the interval that ends at a time.
+            values: The C envelopes, shape (K, C). Each value is the largest magnitude of a
+                signal in the interval that ends at the time of its row.
             floor: Value below which an envelope counts as zero, in the unit of `values`.
             falls_first: True if an envelope that first falls and then rises counts as growing.
                 By default, the trend of such an envelope is undecided.

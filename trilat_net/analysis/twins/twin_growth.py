@@ -16,8 +16,8 @@ the classes such as "grows" and "decays".
 Invariant:
     - Velocities are compared. If a push merely shifts all arms to another equilibrium, the
       difference becomes zero.
-    - In a scenario whose arms form groups that do not follow each other, each group is judged
-      separately. Growth in one group is therefore not hidden by another group.
+    - In a scenario whose arms form groups that are not coupled to each other, each group is
+      judged separately. Growth in one group is therefore not hidden by another group.
 """
 
 import math
@@ -71,8 +71,8 @@ class PushGrowth(NamedTuple):
     """How the effect of one push develops over the judged part of a run.
 
     A push is a small disturbance in a repetition of the run, which is called a twin. Its effect
-    is the difference between the twin and the run. If some arms of the scenario do not follow
-    the others, a push has one such object for each group of arms that follow each other.
+    is the difference between the twin and the run. If some arms of the scenario are not coupled
+    to the others, a push has one `PushGrowth` for each group of coupled arms.
 
     Attributes:
         push: The push: what was changed, when and by how much.
@@ -122,9 +122,10 @@ class _MissChance(NamedTuple):
     def of_directions(cls, directions: int) -> "_MissChance":
         """Estimates how likely pushes in random directions are to miss a clearly growing mode.
 
-        A mode that grows by `CLEAR_GROWTH` is missed if every push excites it with less than 1
-        / `CLEAR_GROWTH` of the usual share. The share of a mode in a push with many random
-        components is nearly normally distributed, with the density 1 / sqrt(2 pi) at zero.
+        A mode that grows by `CLEAR_GROWTH` is missed if its share in every push is less than 1
+        / `CLEAR_GROWTH` of the root-mean-square share. The share in a push with many random
+        components is nearly normally distributed. In units of the root-mean-square share, its
+        density at zero is 1 / sqrt(2 pi).
 
         Args:
             directions: Number of independent random directions.
@@ -137,7 +138,7 @@ class _MissChance(NamedTuple):
 
 
 class RestDeparture(NamedTuple):
-    """Time interval in which a run departed from rest by itself, so this rest is unstable.
+    """Time interval in which a run departed from an unstable pose of rest by itself.
 
     Its twins (repeated runs with a small push) did the same. No operator or wall acted on the
     arms during this time.
@@ -165,7 +166,7 @@ class TwinGrowth(NamedTuple):
         why: The reason why there are no twins. Empty if there are twins.
         from_s: Start of the judged part of the run, in s.
         to_s: End of this part, in s.
-        pushes: Growth of every push, in every group of sites that follow each other.
+        pushes: Growth of the effect of every push, in every group of coupled sites.
         departure: Fastest departure of the run from rest, or `None` if the run did not depart
             from rest.
         same_platform: False if the run was recorded on another platform. The last bits of the
@@ -194,8 +195,8 @@ class TwinGrowth(NamedTuple):
     def hides_period(self) -> bool:
         """True if the period of the delays is longer than the judged part of the run.
 
-        Pushes that decayed in this part might then grow in the rest of the period. A decision
-        without a proof therefore stays open.
+        Effects of pushes that decayed in this part might then grow in the rest of the period. A
+        decision without a proof therefore stays open.
         """
         judged_s = self.to_s - self.from_s
         return self.delay_period_s is not None and self.delay_period_s > judged_s
@@ -222,9 +223,9 @@ class TwinGrowth(NamedTuple):
     def grows(self) -> bool:
         """True if small disturbances of the run grow, which means that the run is unstable.
 
-        A push is a small disturbance in a repetition of the run. Arms that follow each other
-        form a group. The disturbances of a group grow if the effects of at least half of its
-        pushes grow throughout, from `from_s` to `to_s`. They also grow if the motion of the
+        A push is a small disturbance in a repetition of the run. Coupled arms form a group. The
+        disturbances of a group grow if the effects of at least half of its pushes grow
+        throughout, from `from_s` to `to_s`. They also count as growing if the motion of the
         same joint grows throughout after at least two pushes, and is the fastest motion after
         one of these pushes. This second rule exists because a joint that does not act on the
         others moves only after the pushes that reach it. If network delays are random, the
@@ -274,7 +275,7 @@ class TwinGrowth(NamedTuple):
 
     @property
     def needs_s(self) -> float | None:
-        """Length of a run that would clearly show that small pushes decay, in s.
+        """Length of a run that would clearly show that the effects of pushes decay, in s.
 
         In a run of this length, the difference that decays most slowly can halve four more
         times at its present rate. `None` if the differences do not decay, or if the run is
@@ -290,8 +291,8 @@ class TwinGrowth(NamedTuple):
         """Rate in 1/s above which no disturbance of the run can grow.
 
         A disturbance with a larger rate would have grown by the factor `CLEAR_GROWTH` from
-        `from_s` to `to_s`, which the repeated runs would have shown. If not every push decays,
-        no rate is excluded, and the value is infinite.
+        `from_s` to `to_s`, which the repeated runs would have shown. Unless the effect of every
+        push decays, no rate is excluded, and the value is infinite.
         """
         judged_s = self.to_s - self.from_s
         dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
@@ -329,12 +330,12 @@ class TwinGrowth(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for the user on whether small pushes of the run grow or decay.
+        """A sentence for the user on whether the effects of small pushes grow or decay.
 
-        The sentence describes the push that grows most or decays most slowly. If the arms
-        departed from rest by themselves, the sentence describes that motion instead. If the run
-        was not repeated with pushes, the sentence states the reason. The package `presentation`
-        generates it.
+        The sentence describes the push whose effect grows most or decays most slowly. If the
+        arms departed from rest by themselves, the sentence describes that motion instead. If
+        the run was not repeated with pushes, the sentence states the reason. The package
+        `presentation` generates it.
         """
         return str(find_hook("describe a finding")(self))
 
@@ -839,13 +840,13 @@ class PushedTwins(Result):
         Args:
             log: The log.
             at_s: Time of the pushes, in s.
-            push: Sizes by target, as in `{"m1.q1": 1e-6}`, or texts such as "m1.q1=1e-6". Each
-                push makes one twin. By default the pushes are those of a certificate.
-            delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+            push: Sizes by target, as in `{"m1.q1": 1e-6}`, or strings such as "m1.q1=1e-6".
+                Each push makes one twin. By default the pushes are those of a certificate.
+            delta: Range of sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
 
         Raises:
-            UsageError: There is no such target, time or range.
-            LogError: The log cannot be read, or cannot be executed again.
+            UsageError: A target does not exist, or a time, size or range is not allowed.
+            LogError: The log cannot be read, or its run cannot be repeated.
             CodeWithheld: The code of a law of the log may not be executed.
         """
         scenario = log.scenario
@@ -918,11 +919,11 @@ class PushedTwins(Result):
         return str(find_hook("describe a push")(self, pushed))
 
     def headline(self) -> str:
-        """Returns a sentence for the user on how the pushes develop.
+        """Returns a sentence for the user on how the effects of the pushes develop.
 
-        The sentence describes the worst push, which grows most or decays most slowly. If the
-        user requested pushes of several sizes, it states instead for which sizes the effect is
-        proportional to the size.
+        The sentence describes the worst push, whose effect grows most or decays most slowly. If
+        the user requested pushes of several sizes, it states instead for which sizes the effect
+        is proportional to the size.
         """
         return str(find_hook("describe a finding")(self))
 
