@@ -83,10 +83,10 @@ class GapRepair:
             appeared yet.
         dropped: Mapping from reason to number of dropped messages. Invalid replies are added.
         now_ns: Present time on the monotonic clock, in ns.
-        before: Repair of the previous start of the site. None for the first start.
+        before: Object for the previous start of the site. None for the first start.
 
     Attributes:
-        reception: Messages received from the site, which determine the missing numbers.
+        reception: Receives the messages of the site, and counts the missing ones.
     """
 
     def __init__(
@@ -139,14 +139,14 @@ class GapRepair:
 
     @property
     def progress_ns(self) -> int:
-        """Time at which the last missing message arrived, on the monotonic clock, in ns.
+        """Time at which a missing message last arrived, on the monotonic clock, in ns.
 
         If this was long ago, the site probably no longer has any of the missing messages.
         """
         return self._progress_ns
 
     def follow_start(self, boot: int) -> "GapRepair":
-        """Returns the repair for the next start of the site, which continues the counts.
+        """Returns the object for the next start of the site, which continues the counts.
 
         Args:
             boot: Random number that identifies the next start.

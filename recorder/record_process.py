@@ -369,9 +369,9 @@ def record_session(
         join_timeout_s: Longest wait for the session to begin, in s. If None, there is no limit.
         clock: Clock of the recorder.
         say: Function that prints a line for the user.
-        afterwards: Function that processes the finished log, unless the session was
-            interrupted. The recorder remains a member of the session until it returns, and
-            sites with `--stay` wait for that.
+        afterwards: Function that processes the finished log, unless the recorder was
+            interrupted. The recorder remains a member of the session until this function
+            returns, and sites with `--stay` wait for that.
         warn: Function that is called when the connection is open, to warn the user of risks.
 
     Returns:

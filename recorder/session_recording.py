@@ -647,7 +647,7 @@ class Recording:
         self._writer.flush()
 
     def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
-        """Closes the log: writes the message counts and the mark of a complete file.
+        """Closes the log: writes the message counts and marks the file as complete.
 
         A log without this mark was cut off, for example by a power failure.
 

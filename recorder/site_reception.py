@@ -210,7 +210,7 @@ class SiteReception:
         scenario: Scenario of the session.
         name: Name of the site.
         boot: Random number that identifies the start. None if the site has not appeared yet.
-        before: Reception of the previous start. None for the first start.
+        before: Object for the previous start of the site. None for the first start.
 
     Attributes:
         name: Name of the site.
@@ -520,7 +520,7 @@ class SiteReception:
         return is_new
 
     def check_sender(self, reply: Backfill) -> None:
-        """Raises WireError if a reply with missing messages comes from another start or site.
+        """Raises WireError if a reply with resent messages comes from another start or site.
 
         The reply of an earlier start would contain messages with the same numbers but different
         contents.

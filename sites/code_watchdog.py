@@ -65,8 +65,9 @@ def _read_thread_usage() -> tuple[int, int]:
 class WatchedCode:
     """Calls a user's own code, such as a control law, and limits its computing time.
 
-    The control loop of the arm calls the code in every tick, for example every millisecond.
-    Code that is too slow would make the arm unsafe, and ends the run with an error.
+    The control loop of the arm calls the code in every tick, for example every millisecond. If
+    the code is too slow, the run ends with an error, because slow code would make the arm
+    unsafe.
 
     Args:
         name: Name of the code, such as "the law mylaw:MyLaw".

@@ -386,8 +386,8 @@ class DeadManSwitch:
     def held(self) -> bool:
         """True if the dead-man switch is held and the arm may move.
 
-        At least one program must report that a person holds the switch, and no program that has
-        reported this may have been silent for longer than `SWITCH_SILENCE_NS`.
+        At least one program must report that a person holds the switch, and the newest report
+        from each of these programs must be at most `SWITCH_SILENCE_NS` old.
         """
         holders = self._list_holders()
         return bool(holders) and not any(map(self._is_silent, holders))

@@ -99,7 +99,7 @@ class _Rehearsal(LoopStats):
         self._late_us.append(late_us)
 
     def step(self, tick: int, arrivals: Sequence[Arrival]) -> TickRecord:
-        """Computes one tick of an arm without other arms, to test its timing.
+        """Computes one tick of the arm without samples from other arms, to test the timing.
 
         Called by the loop in place of `_LoopSite.step`.
 
@@ -115,8 +115,8 @@ class _Rehearsal(LoopStats):
     def run_housekeeping(self, *_: object) -> bool:
         """Does nothing, because this test of the control loop has no network.
 
-        Called by the loop after each tick, where the site of a session sends and receives
-        messages.
+        The loop calls this method ten times per second. In a session, the site then replies to
+        queries and publishes events.
 
         Returns:
             False, to continue the loop.

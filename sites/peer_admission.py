@@ -57,7 +57,8 @@ class PeerAdmission:
         """Updates who takes part in the session, and checks if a peer is away for too long.
 
         A member is present while its liveliness token exists, which is observed by the monitor.
-        The monitor also collects the events of new processes of peers that may join.
+        The monitor also collects the events with which peers join, and this method applies
+        them.
 
         Args:
             t_ns: Present time, in ns since the epoch (the common start of the session).

@@ -98,8 +98,8 @@ class SiteEnd:
     def leave_session(self) -> int:
         """Publishes how the run ended, waits for the recorders, and tells the user the result.
 
-        The process must stay until then, because the recorders may still request messages that
-        were lost on the network.
+        The process must not end before the recorders are done, because they may still request
+        messages that were lost on the network.
 
         Returns:
             Exit code of the process: 0, or 128 plus the number of the signal that ended the

@@ -59,8 +59,8 @@ class PeerInbox:
     """Receives the samples from the peers of a site, and drops those that fail a check.
 
     For each peer, only samples with a single boot (the number that identifies one start of a
-    process) are accepted, so that a peer that was started twice does not act twice. A site that
-    joins a running session ignores samples from before its own first tick.
+    process) are accepted, so that two processes cannot act as the same peer. A site that joins
+    a running session ignores samples from before its own first tick.
 
     If the scenario lets the arm glide back to its peers after an interruption, two more kinds
     of samples are dropped: those far in the future, and those that the peer's arm cannot have
@@ -289,8 +289,8 @@ class StateBlock:
         send: Function that publishes the encoded records of a block.
         turn: Index of the site in the scenario. Sites on one machine send their blocks in
             different ticks, which spreads the work over time.
-        single: True if each record is sent in its own tick, as the program of an external arm
-            requires.
+        single: True to send each record in its own tick, as required by an external arm, whose
+            driver reads the torque from the records, and by a site that may be restarted.
 
     Attributes:
         holds_samples: True if the samples for the peers are collected too, so that peers on the

@@ -61,8 +61,7 @@ class SiteOptions:
         join_timeout_s: Longest wait for the start of the session, in s.
         needs_recorder: True if the session starts only when a recorder is present.
         cpu: Processor to which the control loop is pinned. If None, all processors may be used.
-        stay_s: Longest time for which the site stays after the run until the recorder has left,
-            in s.
+        stay_s: Longest time that the site waits after the run for the recorder to leave, in s.
         clock_offset_s: Offset added to the clock of the site to emulate another machine, in s.
         clock_drift_ppm: Drift added to the clock of the site, in parts per million.
         without: Sites that the session does not wait for. They may join the running session.

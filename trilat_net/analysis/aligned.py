@@ -69,8 +69,8 @@ class AlignedRecords(NamedTuple):
         wrench: Force at the end effector that corresponds to `tau_x`, shape (K, m). Empty in
             joint space.
         axes: For each coordinate of the task, whether the site follows along it, see `SiteLog`.
-        hand: Recorded action of an operator who acts live, shape (K, h), see `HandInForce`.
-            Empty if there is no such operator.
+        hand: Recorded action of the live operator, shape (K, h), see `HandInForce`. Empty if
+            the site has no live operator.
         rests: True while the site comes to rest, in one of the `RESTING_MODES`, and for
             `RESUMING_S` afterwards, shape (K,). Empty if the site never rests.
     """
@@ -545,7 +545,7 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """Marks the tick periods in which the peer's motion is determined by records alone.
+        """Marks the tick periods in which the peer's motion comes from records alone.
 
         Both its present and its delayed motion must be known. The other periods contain
         interpolated records, so energies that depend on the peer are not judged there. K ticks
@@ -564,7 +564,7 @@ _BEFORE_EPOCH_S = -1.0
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
-    """Finds the rows at which several arms can be compared at the same time.
+    """Finds the rows of several arms that belong to the same times, to compare the arms.
 
     The times are the ticks of the first arm. For every other arm, the row of its latest tick at
     each of these times is returned, since the rates may differ.

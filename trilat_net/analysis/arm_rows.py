@@ -206,7 +206,7 @@ class PlacedArm:
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns zeros, shape (2, ...), because this arm has no joint friction.
 
-        This method exists because chains, which may have friction, are called in the same way.
+        This method lets callers treat this arm like a chain, whose joints may have friction.
 
         Args:
             v: Joint velocities, shape (2, ...), in rad/s. Only the shape is used.
@@ -789,8 +789,8 @@ class ChainArmRows(NamedTuple):
         """Returns the time derivative of the Jacobian of the end effector's position.
 
         Column i of the Jacobian is the velocity of the end effector when joint i moves at unit
-        speed. It changes for two reasons: its axis turns with the joints up to i, and the
-        joints after i move the end effector relative to the axis of joint i.
+        speed. This vector changes for two reasons: the joints up to i rotate it, and the joints
+        after i move the end effector relative to the axis of joint i.
 
         Args:
             q: Joint angles, shape (K, n), in rad.

@@ -489,8 +489,8 @@ def _refuse_plan_options(used_options: Sequence[str]) -> None:
 def parse_seed_count(text: str | None) -> int | list[int]:
     """Parses the option --seeds of a sweep.
 
-    A single number such as 10 is the number of seeds. Forms such as 1..20, 1,5,9 or 7, (with a
-    comma) are lists of seeds.
+    A single number such as "10" is the number of seeds. Forms such as "1..20" and "1,5,9" are
+    lists of seeds, and so is a number followed by a comma, such as "7,".
 
     Args:
         text: The argument of the option, or `None` if the user did not use it.

@@ -54,7 +54,7 @@ NEVER_NEGATIVE = ("alpha", "grip", "age_s")
 WITH_ROUNDING = 1.000001
 """Factor by which the space is larger than a bound that an entry can reach exactly."""
 MOST_DRAWS = {False: 1000, True: 100}
-"""Largest number of random positions that a task tries until one is within reach.
+"""Largest number of random positions that a task draws to find one within reach.
 
 It is smaller for arms with a chain of joints (True), because finding the pose for a position
 requires a numerical search.
@@ -72,7 +72,7 @@ class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
 class Scene(NamedTuple):
     """True state of an episode at one step, from which the task computes the reward.
 
-    It contains the current states of all arms, which the user sees only with a delay.
+    It contains the current states of all arms, while the user sees the other arms with a delay.
 
     Attributes:
         t_s: Time since the start of the run, in s.
@@ -81,8 +81,9 @@ class Scene(NamedTuple):
         view: State as the user observes it.
         bodies: Poses of simulated bodies, by the site that simulates them and by name. Each
             pose has the shape (7,), as in a record.
-        can_reach: Returns whether the end effector of a site can reach a position, in m.
-        draws: Largest number of random positions that a task may try until one is within reach.
+        can_reach: Function that returns whether the end effector of a site can reach a
+            position, in m.
+        draws: Largest number of random positions that a task may draw to find one within reach.
     """
 
     t_s: float
@@ -277,9 +278,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         ticks_per_step: Number of ticks per step.
 
     Raises:
-        ScenarioError: The scenario or an override is not valid.
-        UsageError: There is no such site, the rate is not valid, Gymnasium is missing, or
-            another argument has an invalid value, which the message names.
+        ScenarioError: The scenario or an override is not valid, or the scenario does not
+            contain the site `user` or `leads`.
+        UsageError: The rate is not valid, Gymnasium is missing, or another argument has an
+            invalid value, which the message names.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's
@@ -455,7 +457,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Raises an error if `vary` has invalid keys or values, before the first episode.
 
         Raises:
-            ScenarioError: There is no such key, or a value is not valid for it.
+            ScenarioError: A key does not exist, or a value is not valid for it.
             UsageError: A key has no values.
         """
         for key, values in self._vary.items():
@@ -470,7 +472,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """Returns the arm that the agent moves, with its force or position limits.
 
         Args:
-            scenario: Scenario of one episode, in which the user's site has such an operator.
+            scenario: Scenario of one episode, in which the agent is the live operator of the
+                user's site.
         """
         spec = scenario.sites[self.user]
         hand = spec.find_live_hand()
@@ -734,7 +737,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
         Raises:
             UsageError: The action is not valid. The episode does not advance.
-            EpisodeError: No episode has begun, or it has ended.
+            EpisodeError: No episode has begun, or the last one has ended.
         """
         valid_action = self._check_action(action)
         if not self._runs:

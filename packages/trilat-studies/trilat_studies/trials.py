@@ -61,8 +61,8 @@ class TrialResult(NamedTuple):
     Attributes:
         trial: The trial.
         outcomes: Outcome of each expectation.
-        simulated_s: Duration of the run in its own time, in s.
-        wall_s: Duration in real time, in s.
+        simulated_s: Duration of the run according to the times of its ticks, in s.
+        wall_s: Duration of the run in real time, in s.
         error: Reason why the run has no result. Empty if it has a result.
         log: Log of a live trial, if it exists.
         alone: Reason why the run was computed alone, among trials that are computed side by
@@ -79,7 +79,7 @@ class TrialResult(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the simulation was completed and met every expectation of its scenario."""
+        """True if the run was completed and met every expectation of its scenario."""
         return not self.error and all(outcome.held for outcome in self.outcomes)
 
     @property
@@ -181,7 +181,7 @@ class Trial(NamedTuple):
         """Compares the run of a live session with the expectations of its scenario.
 
         Two expectations are added to those of the scenario: the session must have ended
-        normally, and recomputing all records must give the same bits.
+        normally, and recomputing the run must reproduce all records bit for bit.
 
         Args:
             log_file: Log of the session, which may be missing.
@@ -414,7 +414,7 @@ class TrialReport(Result):
         return rows
 
     def failures(self) -> list[str]:
-        """Returns lines on each failed trial, with the commands to repeat and inspect it.
+        """Returns lines about each failed trial, with the commands to repeat and inspect it.
 
         At most `MAX_FAILURES_SHOWN` trials per scenario are explained. Empty if no trial
         failed.

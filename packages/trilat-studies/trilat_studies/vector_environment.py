@@ -131,7 +131,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
 
         Raises:
             UsageError: An action is not valid. No environment advances.
-            EpisodeError: No episode has begun, or it has ended.
+            EpisodeError: An environment that is to be stepped has no episode in progress.
         """
         is_reset = self._autoreset_envs.copy()
         if self.autoreset_mode == AutoresetMode.DISABLED:
@@ -266,8 +266,8 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Calls the method `name` of each environment, or reads the attribute of that name.
 
-        The joint simulation does not update the individual environments, so the states of the
-        episodes are first written back to them.
+        While episodes are simulated together, their environments are not updated. The states of
+        the episodes are therefore first written back to the environments.
         """
         self._write_back()
         return super().call(name, *args, **kwargs)
@@ -278,7 +278,7 @@ class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
         return super().render()
 
     def _write_back(self) -> None:
-        """Copies the states of jointly simulated episodes back into their environments.
+        """Copies the states of the episodes simulated together back into their environments.
 
         The environments can then draw and save their episodes.
         """
@@ -408,7 +408,7 @@ class _LaneEnvs:
         self._goals: Array = np.zeros((count, *np.shape(env.task.goal)))
 
     def load(self, is_stepped: Flags) -> None:
-        """Starts new episodes in place of those that have ended since the last step.
+        """Loads episodes that have begun since the last step, in place of those that ended.
 
         Each episode is simulated in the lane of its environment.
 
@@ -416,7 +416,7 @@ class _LaneEnvs:
             is_stepped: True for environments of the vector environment that are to be stepped.
 
         Raises:
-            EpisodeError: An environment that is to be stepped has no episode.
+            EpisodeError: An environment that is to be stepped has no episode in progress.
         """
         for lane, env in enumerate(self._envs):
             if not is_stepped[self._first + lane]:
@@ -692,7 +692,7 @@ class _LaneEnvs:
 
 
 class _State:
-    """State of all jointly simulated episodes after a step, used to compute observations.
+    """State of all episodes that are simulated together, used to compute observations.
 
     Args:
         envs: The environments.

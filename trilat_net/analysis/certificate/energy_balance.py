@@ -91,9 +91,9 @@ class SiteEnergy:
     def residual(self) -> Array:
         """Change of the site's energy V_i that no energy flow explains, shape (K,), in J.
 
-        The residual is V_i - V_i(0) + dissipation + transfer - work, with the attributes of
-        this class, summed over the judged periods. It still contains the work caused by
-        executing the control law in ticks (see `unexplained`).
+        The residual is V_i - V_i(0) + dissipation + transfer - work, summed over the `judged`
+        periods. The last three terms are the attributes of the same names. The residual still
+        contains the work caused by executing the control law in ticks (see `unexplained`).
         """
         dissipated_energies = [kind.total for kind in self.dissipation.values()]
         work_of_sources = [source.total for source in self.work.values()]
@@ -148,9 +148,9 @@ class SiteEnergy:
     def begin_s(self) -> float:
         """Time of the first tick at which the energy V_i of the site can be computed, in s.
 
-        V_i depends on the motion of the other sites since they sent the states in use, which
-        the first records do not cover. The time is infinite if V_i cannot be computed at any
-        tick.
+        V_i depends on the motion of the other sites since they sent the states in use. At the
+        first ticks, this motion may not be recorded. The time is infinite if V_i cannot be
+        computed at any tick.
         """
         known = []
         for peer_motion in self.followed.values():
@@ -342,8 +342,8 @@ class EnergyBalance:
     """The energy function V of a group of sites over time, and all energy flows that change it.
 
     Energies are given at the T ticks of the fastest site, in J, with shape (T,) unless stated
-    otherwise. Dissipation, work and transfer are accumulated over the judged periods since the
-    first tick.
+    otherwise. Dissipation, work and transfer are accumulated over the `judged` periods since
+    the first tick.
 
     Attributes:
         t_s: Times of the ticks, in s.
@@ -356,7 +356,7 @@ class EnergyBalance:
             `unexplained`).
         transfer: Transferred energy that the weights do not cancel. 0 if the weights are
             correct.
-        judged: True if the period before a tick is determined by records alone, shape (T - 1,).
+        judged: True for each tick period whose energies all come from records, shape (T - 1,).
     """
 
     t_s: Array
@@ -371,9 +371,9 @@ class EnergyBalance:
 
     @cached_property
     def unjudged_spans(self) -> list[tuple[float, float]]:
-        """Time spans in which V cannot be judged because records are missing.
+        """Time spans in which V cannot be evaluated because records are missing.
 
-        Each span is a pair of start and end, in s. The list is empty if V can be judged
+        Each span is a pair of start and end, in s. The list is empty if V can be evaluated
         throughout.
         """
         # Judged periods before and after the run give each span a start and an end.
@@ -397,9 +397,9 @@ class EnergyBalance:
     def residual(self) -> Array:
         """Change of V that no energy flow explains, shape (T,), in J.
 
-        The residual is V - V(0) + dissipation - work, summed over the judged periods (those
-        determined by records alone). It includes the work of sampling, and should otherwise be
-        close to 0. A large residual shows that the records contradict each other.
+        The residual is V - V(0) + dissipation - work, summed over the tick periods that can be
+        evaluated from the records alone. It includes the work of sampling, and should otherwise
+        be close to 0. A large residual shows that the records contradict each other.
         """
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
@@ -524,12 +524,13 @@ class EnergyBalance:
         )
 
     def find_unsupplied_growth(self, tolerance: float) -> list[UnsuppliedGrowth]:
-        """Finds rises of the energy V that no source supplied, although the run looks stable.
+        """Finds growth of the energy V that no external source supplied.
 
-        The work of operators and environments is first subtracted from V, the energy function
-        of the stability proof. Two rules are then checked. First, V must not end higher than it
-        started. Second, in the second half of the run, the rise from the minimum to the end
-        must be at most half of the fall from the beginning of this half to the minimum.
+        Such growth contradicts a stable run. The work of operators and environments is first
+        subtracted from V, the energy function of the stability proof. Two rules are then
+        checked. First, V must not end higher than it started. Second, in the second half of the
+        run, the rise from the minimum to the end must be at most half of the fall from the
+        beginning of this half to the minimum.
 
         Args:
             tolerance: Threshold that a rise must exceed to count, in J.

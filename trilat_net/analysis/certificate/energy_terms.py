@@ -247,7 +247,8 @@ class SiteMotion:
         dominance: Dominance factors of the site.
         peers: Motion of the peers as received by the site, in the order of the dominance
             factors.
-        torque: External torque on the arm, divided into operator and environment.
+        torque: External torque on the arm, split into that of operators and that of
+            environments.
         scheme: "digital" if the controller holds the torque of a tick until the next tick,
             "second_order" if the controller extrapolates the torque.
         common: 1 for each coordinate that all sites follow, and 0 for the others. Empty if all
@@ -264,7 +265,7 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """Converter from errors between the arms to motion and torque of this arm's joints.
+        """Conversion of errors between the arms to motion and torque of this arm's joints.
 
         The conversion differs between arms that follow joint by joint and arms that follow with
         their end effectors.
@@ -308,9 +309,9 @@ class SiteMotion:
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Direction Y'r in which the law changed its estimates in each tick period.
 
-        Y is the regressor of the arm's dynamics, Y' its transpose, and r the filtered error.
-        Y'r is evaluated at the start of the period or averaged over its ends, in the same way
-        as the law did. The shape is (K - 1, P).
+        Y is the regressor of the arm's dynamics, Y' its transpose, and r the filtered error. As
+        in the law, Y'r is evaluated at the start of the period under the scheme `digital`, and
+        averaged over both ends of the period under `second_order`. The shape is (K - 1, P).
         """
         if self.scheme == "digital":
             return self.Yr[:-1]
@@ -380,11 +381,11 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """Marks the records at which the arm comes to rest, or did so shortly before.
+        """Marks the records in which the arm is coming to rest, or did so shortly before.
 
-        While its arm comes to rest, the site adds a braking torque, for example because a peer
-        is silent. The recorded torque may therefore differ from the torque of the control law
-        and must not be compared with it. The shape is (K,).
+        While the arm comes to rest, for example because a peer is silent, the site adds a
+        braking torque. The recorded torque may therefore differ from the torque of the control
+        law and must not be compared with it. The shape is (K,).
         """
         records = self.records
         if records.rests.size:
@@ -444,11 +445,11 @@ class SiteMotion:
     def ends(self) -> _PeriodEnds:
         """State of the site at the start and end of every tick period.
 
-        The reference is the mean of the delayed peer motions, weighted with the dominance
+        The reference is the mean of the delayed peer motions, weighted by the dominance
         factors. Within a period, the delays are assumed constant, and the reference moves
         smoothly. At the end of the period it jumps to its next recorded value. If samples of a
-        peer stop arriving, the rule for silent peers determines the reference instead. In that
-        case its recorded velocity is integrated with the trapezoidal rule.
+        peer stop arriving, the rule for silent peers determines the reference instead. The
+        recorded velocity of the reference is then integrated with the trapezoidal rule.
         """
         records = self.records
         dominance = self.dominance
@@ -869,11 +870,12 @@ def _energy_in_transit(constants: SiteConstants, peer_motion: DelayedPeer) -> Ar
 
 
 class Increment(NamedTuple):
-    """The amount of energy in each of K - 1 tick periods, in J, shape (K - 1,) each.
+    """An energy, such as dissipated energy or work, in each of K - 1 tick periods, in J.
 
-    The energy is the integral of a power, computed with the trapezoidal rule, plus a sudden
-    change: at the end of each period a new sample of a peer comes into use, so the error of the
-    site jumps, and some energies change with it.
+    The energy in a period is the integral of a power, computed with the trapezoidal rule, plus
+    a sudden change: at the end of each period a new sample of a peer comes into use, so the
+    error of the site jumps, and some energies change with it. Each attribute has one value per
+    period, shape (K - 1,).
 
     Attributes:
         left: Contribution of the power at the start of the period.
@@ -887,7 +889,7 @@ class Increment(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """Change of the energy in each tick period, in J.
+        """The energy in each tick period, in J.
 
         The sum of `left`, `right` and `jump`, shape (K - 1,).
         """
@@ -949,7 +951,7 @@ def _zero_increment(site: SiteMotion) -> Increment:
 
 
 def _weighted_square(c: SiteConstants, x: Array) -> Array:
-    """Returns |x|^2 = x'Kd x, weighted with the damping gain, of every row, shape (K,)."""
+    """Returns |x|^2 = x'Kd x, weighted by the damping gain, of every row, shape (K,)."""
     weighted_squares = c.Kd * x**2
     return sum_rows(weighted_squares)
 

@@ -132,10 +132,10 @@ def _name_energy(kind: _EnergyKind, site: str, peer: str) -> str:
 
 
 class ObservedEnergy(NamedTuple):
-    """Verdict on a run based on the energies that its laws declare, such as an energy tank.
+    """Verdict on a run, based on energies that its laws declare, such as the level of a tank.
 
     `ObservedEnergy.of_log` computes the declared energies and compares them with recorded
-    torques and motion. A law that never returns more energy than it received is evidence that
+    torques and motion. If no law returns more energy than it received, this is evidence that
     the run is stable.
 
     Attributes:
@@ -378,7 +378,7 @@ def _read_law_memory(
 ) -> dict[str, Array]:
     """Returns the recorded values that a control law keeps from one tick to the next.
 
-    An integral of the error is such a value. A tick is a period of the control loop.
+    An example is an integral of the error. A tick is a period of the control loop.
 
     Args:
         log: The log of the run.

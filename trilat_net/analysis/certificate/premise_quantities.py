@@ -34,7 +34,7 @@ class FunctionalObstacle(Enum):
     UNKNOWN_PARAMETERS = auto()
     """The parameters theta of the arm are unknown."""
     LAW = auto()
-    """The control law has no such function."""
+    """The control law has no energy function V."""
     ORIENTATIONS = auto()
     """The arm follows orientations. Then ed is not the derivative of e."""
 
@@ -42,8 +42,7 @@ class FunctionalObstacle(Enum):
 class MissingFunctional(NamedTuple):
     """Arms for which the energy function V does not exist, all for the same reason.
 
-    The stability proof requires V, which never rises. Some control laws do not have such a
-    function.
+    The stability proof requires V, which never rises. V exists only for some control laws.
 
     Attributes:
         obstacle: The reason.
@@ -105,7 +104,7 @@ class ParameterFault(Enum):
     """Reason why an adaptive law cannot learn the true parameters theta of its arm.
 
     The proof assumes that there are constant parameters for which the law's model is exact.
-    Each fault violates this assumption. The premise names the affected sites.
+    Each fault violates this assumption. The text of the premise names the affected sites.
     """
 
     OUTSIDE_BOX = auto()
@@ -153,7 +152,8 @@ class WallQuantities(NamedTuple):
     may remove.
 
     Attributes:
-        walls: The walls that were touched, with their energies and dampings.
+        walls: The walls that were touched, each with the energy that it generated and the
+            required and actual damping of the arm.
     """
 
     walls: tuple[WallEnergy, ...]
@@ -225,7 +225,7 @@ class DelayQuantities(NamedTuple):
 
 
 class Interruption(NamedTuple):
-    """Time interval in which an arm did not follow the other arms.
+    """Time from the first to the last moment at which an arm did not follow the other arms.
 
     The stability theorem requires that all arms follow throughout the run. An arm stops
     following, for example, when no samples arrive and it holds its position.
@@ -247,7 +247,8 @@ class FollowingQuantities(NamedTuple):
     The stability theorem requires this. It does not cover an arm that was held or stopped.
 
     Attributes:
-        interruptions: Intervals in which sites held, braked, returned or had stopped.
+        interruptions: For each affected site, the time from the first to the last moment at
+            which it held its position, braked, moved back to its reference or had stopped.
         limited_ticks: Number of ticks at which the reference velocity was limited, keyed by
             site name.
         is_halted: True if a site had stopped.
@@ -357,7 +358,8 @@ class Supply(NamedTuple):
         in_task_space: True if a site follows in task space. In that case r is qd - v.
         released_s: Time after which no operator or wall pushes, in s.
         free_s: Duration of the motion after this time, in s.
-        least_free_s: Shortest such duration to which the theorem applies, in s.
+        least_free_s: Shortest duration of a motion without pushes to which the theorem applies,
+            in s.
     """
 
     sources: tuple[str, ...]
@@ -377,8 +379,8 @@ class OperatorQuantities(NamedTuple):
     Attributes:
         unmeasured: Sites with external arms whose external torque is not recorded.
         weightless: Sites that are pushed although their weight in V is zero.
-        supply: Energy supplied by operators and environments, or `None` if there were no pushes
-            or V does not show this energy.
+        supply: Energy supplied by operators and environments, or `None` if no push was
+            recorded or if a pushed site has zero weight in V.
     """
 
     unmeasured: tuple[str, ...] = ()
@@ -564,8 +566,8 @@ class Premise(NamedTuple):
 
     Attributes:
         name: Key of the premise, such as "delays".
-        holds: True if the run meets the condition, False if not, `None` if the log does not
-            decide it.
+        holds: True if the run meets the condition, False if not, `None` if this cannot be
+            determined from the log.
         quantities: What the log shows about the condition.
     """
 

@@ -86,7 +86,7 @@ The rise is excused only up to the residual of the energy balance.
 MIN_FREE_S = 1.0
 """Shortest motion without operators at the end of a run to which the theorem applies, in s."""
 MIN_FREE_AGES = 5.0
-"""Shortest such motion as a multiple of the largest age of a sample in use."""
+"""Shortest motion without operators, as a multiple of the largest age of a sample in use."""
 LEAST_SPEED_M_S = 1e-9
 """Smallest speed of an end effector that counts as motion along an axis, in m/s.
 

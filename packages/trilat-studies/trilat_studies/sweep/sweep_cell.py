@@ -34,9 +34,9 @@ from trilat_net.scenario import Scenario, parse_embedded
 
 
 class CellClass(StrEnum):
-    """Class of the end of a run in a sweep, such as converged or undecided.
+    """Class of a run of a sweep, according to how it ended, such as converged or undecided.
 
-    The values are the words that appear in tables and on pages.
+    The values are the words that appear in tables and on the page of a stability map.
     """
 
     CONVERGED = "converged"
@@ -61,7 +61,8 @@ class CellClass(StrEnum):
         """Returns the class of a run, given the verdict on its stability.
 
         A run that is stable or settled counts as converged. A run that is not stable counts as
-        diverged if it left its limits, drifts or grows, and as bounded otherwise.
+        diverged if an arm left its limits, if the arms drift or if their motion grows, and as
+        bounded otherwise.
 
         Args:
             stability: The verdict.
@@ -143,12 +144,11 @@ class CellResult(msgspec.Struct, frozen=True):
 
     @classmethod
     def unsimulated(cls, verdict: CellClass, reasons: str) -> "CellResult":
-        """Creates the result of a cell that was decided without a simulation.
+        """Creates the result of a cell whose class was determined without a simulation.
 
         Args:
             verdict: Class of the cell.
-            reasons: Reasons why the cell is rejected or undecided. Empty if the cell is
-                decided.
+            reasons: Reasons why the cell was rejected or is undecided. Otherwise empty.
         """
         return cls(
             verdict=verdict,
@@ -262,8 +262,8 @@ class _CellInProgress:
     def note_first_end(self) -> None:
         """Evaluates the run at the end of its planned duration, before any extension.
 
-        Totals, such as the RMS error, are taken at this point. A run that chatters at a wall is
-        not extended, see `classify_cell`.
+        Totals, such as the RMS error, cover the run up to this point. A run that chatters at a
+        wall is not extended, see `classify_cell`.
         """
         self._totals = self.run.totals._asdict()
         self._evaluate()
@@ -291,7 +291,7 @@ class _CellInProgress:
         self._evaluate()
 
     def judge(self) -> CellResult:
-        """Classifies the end of the run according to the stability certificate.
+        """Classifies how the run ended, according to the stability certificate.
 
         Called once, after the last extension, because the certificate needs the roots of the
         control loop, which are slow to compute.
@@ -322,15 +322,15 @@ class _CellInProgress:
 
 
 def classify_cell(text: str, longest_s: float) -> CellResult:
-    """Runs a cell in virtual time and classifies the end of the run.
+    """Runs a cell in virtual time and classifies how the run ends.
 
     While a longer run might belong to another class (see `CellResult.is_conclusive`), the
     duration is doubled and the same run continues, up to `longest_s`. The class then follows
     from the stability certificate's verdict on the complete run, see `CellClass.of_decision`.
 
-    A run that chatters at a sampled wall, where its small motions grow, is not extended. Such
-    chatter may end after minutes, once the estimates of the law have drifted, but this does not
-    make the cell stable.
+    A run that chatters, because small motions grow in contact with a sampled wall, is not
+    extended. Chatter may end after minutes, once the parameter estimates of the law have
+    drifted, but this does not make the cell stable.
 
     Args:
         text: Canonical text of the cell's scenario. Its `duration_s` is the initial duration.
@@ -359,7 +359,7 @@ class _JudgedCell(NamedTuple):
 
 
 def classify_cells(scenarios: Iterable[Scenario], longest_s: float) -> Iterator[_JudgedCell]:
-    """Runs cells side by side where possible, and classifies the end of each run.
+    """Runs cells side by side where possible, and classifies how each run ends.
 
     The results equal those of `classify_cell`, which explains the method.
 
@@ -544,8 +544,8 @@ class CellRun(msgspec.Struct, frozen=True):
         scenario: Canonical text of the run's scenario, as differences from the scenario of the
             sweep.
         outcome: Result of the run.
-        metrics: Further metrics of the sweep over the scenario's duration, by key. `None` for a
-            metric that the run does not have.
+        metrics: Further metrics requested for the sweep, measured over the scenario's duration,
+            by key. `None` for a metric that the run does not have.
         alone: Reason why the run was computed alone, in a sweep whose runs are computed side by
             side. Empty if it was not computed alone.
     """

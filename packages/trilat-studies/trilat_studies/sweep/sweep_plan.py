@@ -35,7 +35,7 @@ MAX_EXTENSION = 8.0
 MAX_SCENARIO_S = 86_400.0
 """Longest duration that a scenario may have, in s."""
 JUDGES = ("verdict", "twins", "linear")
-"""Ways to judge a cell. "verdict" classifies the end of its run. "twins" repeats the run with a
+"""Ways to judge a cell. "verdict" classifies how its run ends. "twins" repeats the run with a
 small push and measures the growth exponent, the rate at which the disturbance grows. "linear"
 computes the characteristic roots of the linearised loop, without a run.
 """
@@ -80,8 +80,8 @@ class SweepPlan(NamedTuple):
         judge: How runs are judged, a name in `JUDGES`.
         metrics: Keys of further metrics from `docs/reference/metrics.md` to measure in each
             run.
-        refine: Number of times that the boxes along the stability edge are halved, see
-            `edge_refinement`. 0 runs all cells.
+        refine: Number of times that the boxes of the grid along the stability edge are halved,
+            see `edge_refinement`. If 0, all cells are run.
     """
 
     written: ExperimentText
@@ -101,7 +101,7 @@ class SweepPlan(NamedTuple):
 
         This is the duration of the scenario times `MAX_EXTENSION`, but at most
         `MAX_SCENARIO_S`. If cells are judged by how fast small disturbances grow, runs are
-        never extended, and it is the duration of the scenario.
+        never extended, and the default is the duration of the scenario.
         """
         extension = MAX_EXTENSION if self.judge == "verdict" else 1.0
         return min(MAX_SCENARIO_S, extension * self.base.duration_s)
@@ -196,8 +196,8 @@ class SweepPlan(NamedTuple):
 
         `from_facts` restores the plan. The keys "judge" (how runs are judged), "metrics" (which
         further metrics are measured) and "refine" (how often the stability edge is refined) are
-        omitted if they have their defaults. Plans written by older versions therefore give the
-        same file.
+        omitted if they have their defaults. Plans from older versions, which lack these keys,
+        are therefore encoded in the same way.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,
@@ -286,7 +286,7 @@ class SweepPlan(NamedTuple):
         return format_command("sweep", self.written.label, *arguments, *more)
 
     def list_totals(self) -> list[str]:
-        """Lists the quantities whose means over the seeds the sweep computes.
+        """Lists the quantities that the sweep averages over the seeds.
 
         These are the totals of every run, such as the RMS error, and the metrics requested for
         this sweep.

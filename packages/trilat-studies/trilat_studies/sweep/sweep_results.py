@@ -208,9 +208,9 @@ class SweepResults(Result):
     def summarize(self) -> Iterator[str]:
         """Yields the lines of the summary that is printed after a sweep.
 
-        The lines state how many runs each class has, how many runs were extended, the ranges of
-        the measured quantities, the growth exponents, and the differences between seeds. Lines
-        that do not apply to the sweep are omitted.
+        The lines state how many runs are in each class, how many runs were extended, the ranges
+        of the measured quantities, the growth exponents, and the differences between seeds.
+        Lines that do not apply to the sweep are omitted.
         """
         plan = self.plan
         tally = _tally_rows(self)
@@ -383,7 +383,7 @@ class _ValueRange:
     def add(self, value: float | None) -> None:
         """Updates the smallest and the largest value with the value of one run.
 
-        `None`, the value of a run that lacks the quantity, is ignored.
+        If the run lacks the quantity, the value is `None` and is ignored.
         """
         if value is None:
             return

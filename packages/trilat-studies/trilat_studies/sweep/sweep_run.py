@@ -120,7 +120,8 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
     Args:
         path: Path of the folder.
         expected: Sweep that the folder must contain. If `None`, any sweep is accepted that was
-            started with the arithmetic and program versions of this process.
+            started with the same program versions, on a machine with the same floating-point
+            arithmetic.
 
     Raises:
         UsageError: The folder contains no sweep, or another sweep.
@@ -232,7 +233,7 @@ class DurationEstimate(NamedTuple):
     Attributes:
         runs: Largest possible number of remaining runs.
         seconds: Estimated duration of these runs, in s of real time.
-        entries: Runs that were made for the estimate. The sweep does not repeat them.
+        entries: Runs that were executed for the estimate. The sweep does not repeat them.
     """
 
     runs: int
@@ -319,7 +320,7 @@ class DurationEstimate(NamedTuple):
 class FinishedSweep(NamedTuple):
     """Results of a finished sweep, with the number of runs and the time that they took.
 
-    All counts and times start at the last start or resumption of the sweep.
+    `runs`, `simulated_s` and `wall_s` count from when the sweep was last started or resumed.
 
     Attributes:
         results: Results of all runs of the sweep.
@@ -585,8 +586,8 @@ def run_sweep(
 
     Raises:
         ScenarioError: A cell cannot run. The message names the cell. Finished runs are kept.
-        RunFailed: A cell killed its workers, or the cluster is no longer available. Finished
-            runs are kept.
+        RunFailed: A cell crashed the workers that ran it, or the cluster is no longer
+            available. Finished runs are kept.
     """
     plan = folder.plan
     clock = SystemClock()

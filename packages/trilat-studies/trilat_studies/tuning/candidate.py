@@ -129,7 +129,8 @@ def build_twin(scenario: Scenario) -> Scenario | None:
         scenario: Scenario of the candidate.
 
     Returns:
-        The twin, or `None` if the scenario has no such walls and operators and needs no twin.
+        The twin, or `None` if the scenario has neither walls nor operators who push without a
+        target pose, and therefore needs no twin.
     """
     sites = {}
     for name, spec in scenario.sites.items():
@@ -147,7 +148,7 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     """Computes q*, the pose on which the arms would agree in the absence of gravity.
 
     While operators pull the arms like springs towards target poses, each joint of q* is an
-    average of the targets, weighted with the stiffness of the operators and the influence of
+    average of the targets, weighted by the stiffness of the operators and the influence of
     their arms. Before any operator pulls, q* is the weighted average of the start poses. After
     the last operator has released its arm, q* keeps its value.
 
@@ -242,7 +243,7 @@ class CandidateClass(StrEnum):
     """How the arms behave with a control law and chosen gains, from worst to best.
 
     If several classes apply to a run, the first one counts. `CLASS_MEANINGS` explains each
-    class. JSON files contain the values.
+    class. The values are the words that appear in JSON files.
     """
 
     DIVERGED = "diverged"
@@ -254,7 +255,7 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """Word for the end of a candidate's run in printed text, such as "stable".
+        """Word for the class in printed text, such as "stable".
 
         Where possible, this is the word used in the verdict on a single run.
         """
@@ -278,11 +279,11 @@ class CandidateClass(StrEnum):
         Args:
             ends: Analysis of the end of the run and of the second run. If there is no second
                 run, the first one is passed twice.
-            fall_rad: Predicted distance, in rad, between the mean pose of the arms and q*, or
-                the mean of the promised motion, at the end of a run twice as long. The largest
-                distance over the joints counts.
-            apart_rad: Largest distance of a joint from the mean of all arms, or from the
-                promised motion, in the last second, in rad.
+            fall_rad: Predicted distance of the arms' mean pose, at the end of a run twice as
+                long, from q* or, if the law promises another motion, from the mean of that
+                motion, in rad. The largest distance over the joints counts.
+            apart_rad: Largest distance of a joint from the mean of all arms, or from the motion
+                that the law promises, in the last second, in rad.
 
         Returns:
             The worst class that applies to one of the runs.
@@ -322,8 +323,9 @@ _POSE_SAMPLES = 2000
 def check_final_posture(log: Log) -> list[str]:
     """Warns if the end of a run reveals little about its control law.
 
-    There are three warnings:
+    There are four warnings:
 
+    - A site diverged. The other warnings are then left out.
     - The run is shorter than planned.
     - An arm hangs down (both of its links point down) and did not hang at the start. Its errors
       and torques are small, but not because of the control law.
@@ -334,7 +336,7 @@ def check_final_posture(log: Log) -> list[str]:
         log: Log of the run.
 
     Returns:
-        The warnings, one sentence each. Empty if the log is complete and its arms did not fall.
+        The warnings that apply, one sentence each. May be empty.
 
     Raises:
         LogError: A record cannot be read.
@@ -766,7 +768,7 @@ class TuningScenario(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Name or path of the scenario, as commands accept it: "paper" or "mine.toml"."""
+        """Name or path of the scenario for use in commands, such as "paper" or "mine.toml"."""
         return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
@@ -855,7 +857,7 @@ class CandidateItem(NamedTuple):
         runs: For each random seed, the text of the scenario and the text of its twin, which
             excludes walls and operators who push the arms without a target pose. The second
             text is `None` if the scenario has none of these.
-        name: Name of the law and its gains in error messages.
+        name: Text that identifies the law and its gains in error messages.
         is_side_by_side: True to compute the runs together with others, if possible.
     """
 
@@ -868,7 +870,7 @@ class CandidateItem(NamedTuple):
 
     @classmethod
     def of_seeds(cls, seeds: Sequence[TuningScenario]) -> "CandidateItem":
-        """Packs the runs of one candidate as work for another process.
+        """Bundles the runs of one candidate, so that another process can execute them.
 
         Args:
             seeds: The scenario with the law and its gains for each random seed, at least one.

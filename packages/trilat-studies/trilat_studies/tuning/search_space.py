@@ -353,11 +353,11 @@ one.
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
-    """Returns, for each joint of a chain, a factor that scales gains which produce a torque.
+    """Returns a scaling factor for the torque-producing gains of each joint of a chain.
 
     The factor of joint i is its inertia while the other joints are free, 1 / (M^-1)_ii,
-    relative to the largest such inertia of all joints, where M is the inertia matrix. Among the
-    start poses of the sites, the pose with the least inertia is used.
+    relative to the largest such inertia of all joints, where M is the inertia matrix. For each
+    joint, the smallest of its inertias in the start poses of the sites is used.
 
     All factors are reduced if the largest damping in the search ranges would be unstable at the
     arms' tick rate. `validate` rejects damping gains D for which the largest eigenvalue of h

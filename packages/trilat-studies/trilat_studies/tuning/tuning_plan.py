@@ -76,7 +76,8 @@ class Objective(StrEnum):
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
         """Returns the objective (error or time) and the motor effort of a candidate.
 
-        The Pareto front consists of the candidates that no other candidate beats in both.
+        The Pareto front consists of the candidates for which no other candidate is at least as
+        good in both.
 
         Args:
             score: Score of the candidate.
@@ -480,7 +481,8 @@ class TuningPlan(NamedTuple):
             on: Workers to use instead of processes on this machine.
 
         Raises:
-            RunFailed: A candidate killed its workers, or the cluster is no longer available.
+            RunFailed: A candidate crashed the workers that ran it, or the cluster is no longer
+                available.
         """
         searches = [
             CandidateSearch(space, self.budget, self.seed, self.objective)
@@ -562,7 +564,7 @@ class TuningPlan(NamedTuple):
         space: SearchSpace,
         candidates: Sequence[CandidateGains],
     ) -> list[CandidateItem]:
-        """Packs the candidates of one law as work for worker processes.
+        """Bundles the runs of each candidate of one law, so that workers can execute them.
 
         Args:
             bases: Scenario with each seed.
@@ -741,7 +743,7 @@ class TuningResult(Result):
             search: Search of the law.
 
         Returns:
-            One string per such gain. May be empty.
+            The names of these gains. May be empty.
         """
         if not search.front:
             return []

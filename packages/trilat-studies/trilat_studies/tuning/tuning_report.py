@@ -131,8 +131,8 @@ class TuningReport:
         """Returns notes on laws with a declared energy, which the tuning does not check.
 
         The tuning classifies runs by the motion of the arms only. A run in which a law's
-        declared energy became negative can therefore count as stable here, while its
-        certificate is open.
+        declared energy became negative can therefore count as stable here, although the verdict
+        of its certificate is "open".
         """
         laws = []
         for search in self._tuned.found:
