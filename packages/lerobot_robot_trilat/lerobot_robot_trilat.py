@@ -88,10 +88,10 @@ class TrilatRobot(Robot):
         self._action_keys = [f"{axis}.{quantity}" for axis in axes]
         self._position_keys = [f"{axis}.pos" for axis in axes]
         self._felt_keys = [f"{axis}.felt" for axis in axes]
-        self._sites = (config.slave, config.site)
-        self._joint_keys: list[str] = []
         # Without repetitions, because both names may be the same.
-        for site in dict.fromkeys(self._sites):
+        self._sites = tuple(dict.fromkeys((config.slave, config.site)))
+        self._joint_keys: list[str] = []
+        for site in self._sites:
             joint_names = scenario.arms[site].joint_names
             for joint_quantity in ("pos", "vel", "tau_x"):
                 keys = [f"{site}.{joint}.{joint_quantity}" for joint in joint_names]

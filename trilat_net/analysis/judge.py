@@ -163,12 +163,13 @@ class VirtualRun:
     @cached_property
     @limit_blas_threads()
     def decision(self) -> StabilityDecision:
-        """The decision on whether the run is stable, the same as in a certificate of the run.
+        """The decision on whether the run is stable.
 
         The run is simulated again to record every tick only if the verdict would otherwise be
         settled or open, if its laws have an energy function V or declare energies, and if it
         has at most `MAX_RECORDED_TICKS` ticks. The energies, which require the records, may
-        prove that the run is stable, or contradict the verdict that it settled.
+        prove that the run is stable, or contradict the verdict that it settled. Up to that
+        number of ticks, the decision is the same as in a certificate of the run.
         """
         scenario = self._scenario
         decision = self._findings._replace(twins=self.twins).decide()

@@ -139,7 +139,7 @@ _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class EndDoubt(NamedTuple):
-    """Finding that leaves open whether a run is stable although its motion decays.
+    """Finding that keeps the motion at the end of a run from showing that the run is stable.
 
     Attributes:
         name: Name of the finding. "sites apart": coupled sites do not agree, although nothing

@@ -109,9 +109,9 @@ def make_env(
             and clipped.
 
     Raises:
-        ScenarioError: The scenario or an override is not valid.
-        UsageError: There is no such site, the rate is not valid, Gymnasium is missing, or
-            another argument has an invalid value, which the message names.
+        ScenarioError: The scenario or an override is not valid, or the scenario lacks the site.
+        UsageError: The rate is not valid, Gymnasium is missing, or another argument has an
+            invalid value, which the message names.
     """
     env = TeleoperationEnv(scenario, set, **settings)
     if num_envs is None:

@@ -274,8 +274,8 @@ def bench(
         The runs of all combinations of tasks, laws and links, with their results.
 
     Raises:
-        UsageError: There is no such study, task, law or link, or the folder contains something
-            else.
+        UsageError: The study, a task, a law or a link is unknown, or the folder contains
+            something else.
     """
     from .bench import plan_bench, prepare_bench_folder, run_bench
 

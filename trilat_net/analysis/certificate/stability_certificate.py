@@ -13,8 +13,8 @@ combines:
 - how complete the records are, and whether the log was modified.
 
 Invariant:
-    - The certificate names every question that a log cannot answer. If V does not exist, only
-      the end of the run decides.
+    - The certificate names every question that a log cannot answer. If V does not exist, the
+      other evidence decides.
     - Keys of the JSON output end in their unit, and unknown values are null.
     - The package `presentation` generates every sentence on request.
 """

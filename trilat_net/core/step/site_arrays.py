@@ -12,8 +12,8 @@ Invariant:
     - The compiled code of a control period reads and writes nothing but these arrays and
       `TickBuffers`.
     - Two arms with equal setups have equal arrays.
-    - The links of an arm use at most `MAX_LINKS_BYTES` of memory, unless the delays in the setup
-      require more.
+    - The links of an arm use at most `MAX_LINKS_BYTES` of memory, unless the delays in the
+      setup require more.
 """
 
 from collections.abc import Sequence

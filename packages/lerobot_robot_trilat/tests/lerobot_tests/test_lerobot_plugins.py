@@ -97,6 +97,18 @@ def test_robot_has_no_cameras_and_ends_with_session(
     assert not robot.is_connected
 
 
+def test_an_arm_named_twice_is_observed_once(
+    found_plugins: dict[str, ModuleType],
+) -> None:
+    robot = make_device(found_plugins[ROBOT].TrilatRobotConfig(slave="m2"))
+    robot._hand = SimpleNamespace(over=False, pose=[7.0, 8.0], force=[9.0, 10.0])
+    robot._records["m2"] = SimpleNamespace(q=[1.0, 2.0], qd=[3.0, 4.0], tau_x=[5.0, 6.0])
+    robot._receive_records = list
+    observed = robot.get_observation()
+    assert list(observed) == list(robot.observation_features)
+    assert [*observed.values()] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, -9.0, -10.0]
+
+
 SPACE = Path(__file__).parents[4] / "tests" / "presentation" / "cases" / "tool_down.toml"
 
 
