@@ -334,8 +334,8 @@ class Pinger:
     def estimate(self, boot: int) -> OffsetEstimate:
         """Returns the latest estimate of the offset of a member's clock.
 
-        A member without an estimate has an offset of exactly zero, because only members on
-        other machines are pinged.
+        A member without an estimate has an offset of exactly zero, because offsets are
+        estimated only for members on other machines.
 
         Args:
             boot: Boot of the member, the number that identifies the start of its process.
