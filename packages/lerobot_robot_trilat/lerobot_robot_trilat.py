@@ -108,15 +108,15 @@ class TrilatRobot(Robot):
         An observation contains the angle in rad, the velocity in rad/s and the external torque
         in N m of each joint of both arms. It also contains the position of the master's end
         effector in m, and the force in N that the master exerts on the operator (the program
-        that moves the master). In mode `joint`, these are the angles of the master in rad and
-        torques in N m.
+        that moves the master). In mode `joint`, the angles of the master in rad and torques in
+        N m take the place of this position and force.
         """
         keys = [*self._joint_keys, *self._position_keys, *self._felt_keys]
         return dict.fromkeys(keys, float)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Keys of an action, which is a command to the operator that moves the master.
+        """Keys of an action, which is a command that moves the master arm.
 
         Depending on the mode in the scenario, the command is a position in m (mode `tip`),
         angles in rad (`joint`) or a force in N (`force`).
@@ -127,8 +127,8 @@ class TrilatRobot(Robot):
     def is_connected(self) -> bool:
         """True between `connect` and `disconnect`.
 
-        Stays True after the end of the session, because LeRobot disconnects a device only if it
-        is connected, and a device that is not disconnected keeps the process alive.
+        Stays True when the session ends. LeRobot calls `disconnect` only on connected devices,
+        and the process stays alive until `disconnect` has been called.
         """
         return self._hand is not None
 
@@ -219,9 +219,10 @@ class TrilatRobot(Robot):
         return dict(zip(self.observation_features, values, strict=True))
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Sends an action of the policy to the operator that moves the master arm.
+        """Moves the master arm as an action of the policy commands.
 
-        The site enforces the limits on force and speed.
+        The command is sent to the site of the arm. The site enforces the limits on force and
+        speed.
 
         Args:
             action: A command, with the keys of `action_features`.
@@ -318,13 +319,13 @@ def run_policy(
     duration_s: float,
     fps: int,
 ) -> int:
-    """Runs a trained policy that moves the arm of a robot, at a fixed rate.
+    """Runs a trained policy at a fixed rate, to move the arm of a robot.
 
     Args:
         robot: The connected robot.
-        decide: The policy. Its argument has the keys of an exported dataset,
-            `observation.state` and `observation.environment_state`. It returns one number for
-            each key of `action_features`.
+        decide: The policy, as a function. Its argument has the keys of an exported dataset,
+            `observation.state` and `observation.environment_state`. The function returns one
+            number for each key of `action_features`.
         duration_s: Time for which the policy runs, in s.
         fps: Number of decisions per second, as in the training dataset.
 
@@ -355,7 +356,7 @@ def _load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]
         folder: Folder of the policy, whose path ends in `pretrained_model`.
 
     Returns:
-        A function that decides, see `run_policy`.
+        The policy as a function, which is the argument `decide` of `run_policy`.
     """
     # Imported here, because the import takes seconds and the robot does not need it.
     import torch

@@ -1,9 +1,9 @@
 """A LeRobot teleoperator for the master that a person moves in a trilat-net session.
 
 In such a session, a slave arm follows two master arms, one moved by the person and the other
-driven by a policy. An action of the person is the position of the person's arm. Through
-feedback, LeRobot can move that arm, for example to the position of the policy's arm before the
-person intervenes.
+driven by a policy. An action is the position of the master arm that the person holds. Through
+feedback, LeRobot can move this arm, for example to the position of the policy's master arm
+before the person intervenes.
 
 Invariant:
     - The slave follows both users, weighted by their dominance factors, even while the person
@@ -103,7 +103,7 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Keys of the feedback, which is a command to the operator that moves the person's arm.
+        """Keys of the feedback, which is a command that moves the arm held by the person.
 
         Depending on the mode in the scenario, the command is a position in m (mode `tip`),
         angles in rad (`joint`) or a force in N (`force`).
@@ -114,8 +114,8 @@ class TrilatTeleoperator(Teleoperator):
     def is_connected(self) -> bool:
         """True between `connect` and `disconnect`.
 
-        Stays True after the end of the session, because LeRobot disconnects a device only if it
-        is connected, and a device that is not disconnected keeps the process alive.
+        Stays True when the session ends. LeRobot calls `disconnect` only on connected devices,
+        and the process stays alive until `disconnect` has been called.
         """
         return self._hand is not None
 
@@ -131,9 +131,9 @@ class TrilatTeleoperator(Teleoperator):
         pass
 
     def connect(self, calibrate: bool = True) -> None:  # noqa: ARG002 - there is nothing to calibrate
-        """Joins the session, so that the positions of the person's arm can be read.
+        """Joins the session, so that the position of the arm that the person holds can be read.
 
-        The arm is not held: only the person moves it until `enable_torque` is called.
+        `send_feedback` does not move the arm until `enable_torque` is called.
 
         Args:
             calibrate: Ignored, because there is nothing to calibrate.
@@ -164,7 +164,7 @@ class TrilatTeleoperator(Teleoperator):
             self._stack = stack.pop_all()
 
     def get_action(self) -> dict[str, float]:
-        """Returns the current position of the person's arm, as an action for the robot.
+        """Returns the current position of the arm that the person holds, as an action.
 
         Returns:
             The newest position, with the keys of `action_features`.
@@ -185,7 +185,7 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(felt_keys, felt_forces, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Moves the person's arm according to the policy, if torque is enabled.
+        """Moves the arm that the person holds, as the policy commands, if torque is enabled.
 
         The person feels this as a pull or a push.
 
@@ -203,7 +203,7 @@ class TrilatTeleoperator(Teleoperator):
     def enable_torque(self) -> None:
         """Allows `send_feedback` to move the arm, until `disable_torque` is called.
 
-        The arm can then follow a policy before the person intervenes.
+        This lets the arm follow a policy before the person intervenes.
         """
         self._torque_enabled = True
 
@@ -242,7 +242,7 @@ class TrilatTeleoperator(Teleoperator):
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the connection through which feedback moves the person's arm.
+        """Returns the connection through which feedback moves the arm that the person holds.
 
         Raises:
             DeviceNotConnectedError: The teleoperator is not connected; call `connect` first.

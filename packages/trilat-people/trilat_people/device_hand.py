@@ -66,7 +66,7 @@ class DeviceHand:
             ns.
 
     Raises:
-        UsageError: The live operator does not move the end effector of the arm.
+        UsageError: The scenario has no live operator that moves the end effector of the arm.
     """
 
     def __init__(
@@ -120,13 +120,13 @@ class DeviceHand:
         self._sent.clear()
 
     def serve(self) -> None:
-        """Runs one cycle of the device, and is called repeatedly.
+        """Runs one control cycle of the device. Must be called repeatedly.
 
         Reads the position of the device, sends the new target to the site of the arm, and makes
-        the device apply the force to the person.
+        the device apply the reaction force of the arm to the person.
 
         Raises:
-            OSError: The device is silent, or its connection is lost.
+            OSError: The device does not respond in time, or its connection is lost.
         """
         state = self._device.read()
         now_ns = self._clock.monotonic_ns()

@@ -5,7 +5,7 @@ stop and enable arms as ROS services. In the other direction, a ROS topic can
 
 - command an arm, like an operator who holds it,
 - set the dominance factors of a site,
-- or be the robot that is the external arm of a site.
+- or carry the measurements of a robot, which serves as the external arm of a site.
 
 Invariant:
     - ROS is never part of a control loop. A ROS message enters a session only as an operator's
@@ -253,8 +253,8 @@ class DominanceTopic:
     def receive(self, data: bytes, attachment: Attachment) -> None:
         """Receives a message with the dominance factors of a site.
 
-        They are stored until `send_request` sends them to the site. Called in a thread of the
-        network library Zenoh.
+        The factors are stored until `send_request` sends them to the site. Called in a thread
+        of the network library Zenoh.
 
         Args:
             data: The message, encoded in CDR, the binary format of ROS 2. It contains one
@@ -326,7 +326,7 @@ class _SilenceNotice:
     def note_measurement(self) -> None:
         """Records that a measurement from the robot was sent to the site.
 
-        The sequence of notices then starts over.
+        The next notice is then due after `FIRST_NOTICE_NS` without a measurement.
         """
         self._has_measurement = True
         self._due_ns = self._clock.monotonic_ns() + FIRST_NOTICE_NS
@@ -334,8 +334,8 @@ class _SilenceNotice:
     def pop(self, topic: str, site: str) -> str:
         """Returns a notice that the robot sends no measurements, or "" if no notice is due.
 
-        The notice states whether the driver of the robot is silent, or sends joints with other
-        names.
+        The notice states whether measurements have stopped, no message has arrived yet, or the
+        messages contain only joints with other names.
 
         Args:
             topic: Name of the topic, with its leading slash.
@@ -360,11 +360,11 @@ class _SilenceNotice:
 
 
 class RobotArm:
-    """A ROS robot that is the external arm of a site.
+    """A ROS robot that serves as the external arm of a site.
 
     The joint states of the robot are sent to the site, and the torque commanded by the site is
     sent to the controller of the robot, as in a driver that uses `ArmClient`. While the arm
-    must brake, the controller receives its safe command repeatedly.
+    must brake, the safe command is sent to the controller repeatedly.
 
     Args:
         make_client: Function that connects to the process in which the site currently runs.
@@ -446,7 +446,7 @@ class RobotArm:
     def send_command(self) -> None:
         """Sends the robot the site's newest torque, or the safe command if the arm must brake.
 
-        A torque is sent only once.
+        Each torque is sent only once.
         """
         # A site that was restarted needs another client, as a client follows one process.
         if self._client.over:
@@ -999,8 +999,9 @@ def serve_ros2(
             None, no file is written.
 
     Raises:
-        UsageError: There is no router, the file exists, or the settings of a robot do not fit
-            the session.
+        SessionError: The session cannot be reached in time.
+        UsageError: The endpoint of the ROS router belongs to another program, the file exists,
+            or the settings of a robot do not fit the session.
     """
     clock = SystemClock()
     if rviz is not None:
@@ -1039,8 +1040,8 @@ def publish_session(
 ) -> bool:
     """Waits until a session begins, and connects it to ROS 2 until the session ends.
 
-    Robots are connected before the session begins, because the session begins only when their
-    arms send measurements.
+    Robots are connected before the session begins, because the session begins only when they
+    send measurements.
 
     Args:
         ends: Connections to ROS and to the session.

@@ -549,14 +549,14 @@ class _GainSearch:
         *,
         sampled: bool = True,
     ) -> tuple[float, Array]:
-        """Finds the smallest k over all poses at which small motions grow.
+        """Finds the smallest gain parameter k, over all poses, at which small motions grow.
 
         In each pose, k is raised from `start` until motions grow, and the edge below that k is
         then located with Brent's method. The search skips a pose if its motions still decay
         just below the smallest edge found so far.
 
-        With varying delays, motions may grow, decay and grow again as k increases, so the first
-        steps of the search are kept small in that case.
+        If the delays vary, motions may grow, decay and grow again as k increases, so the search
+        then begins with small steps.
 
         Args:
             loop: The linearised loop of the arms.
@@ -662,17 +662,18 @@ class _GainSearch:
         }
 
     def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
-        """Computes the k at the edge, in 1/s^2, as a function of the delay, for a figure.
+        """Computes the stability edge as a function of the delay, for a figure.
 
-        Each delay is a multiple of the tick. The delays are spaced geometrically from one tick
-        to four times the delay of the loop, or to eight ticks if that is longer.
+        The edge is the smallest gain parameter k, in 1/s^2, at which small motions of the
+        sampled loop grow. Each delay is a multiple of the tick. The delays are spaced
+        geometrically from one tick to four times the delay of the loop, or to eight ticks if
+        that is longer.
 
         Args:
             pose: Pose of all arms, shape (n,), in rad or m, for n joints.
 
         Returns:
-            Pairs of a delay, in s, and the smallest k, in 1/s^2, at which small motions of the
-            sampled loop grow.
+            Pairs of a delay, in s, and the edge at this delay, in 1/s^2.
         """
         longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
         geometric_ticks = np.geomspace(1.0, longest_ticks, _CURVE_POINTS)
@@ -699,8 +700,8 @@ class _GainSearch:
 
         Args:
             law: Control law with its gains.
-            share: k of the gains as a fraction of the k at the edge, or `None` for the tuned
-                gains. It is only copied into the result.
+            share: Gain parameter k of the law as a fraction of k at the stability edge, or
+                `None` for the tuned gains. The value is only copied into the result.
             pose: Pose of all arms, shape (n,), in rad or m, for n joints.
             push: Displacement of the first arm, shape (n,), in rad or m.
 

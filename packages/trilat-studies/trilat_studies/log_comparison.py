@@ -104,7 +104,7 @@ class MetricComparison(NamedTuple):
         """Computes the same quantities from several logs for one table.
 
         Args:
-            logs: The logs, which may be torn, short or empty.
+            logs: The logs, which may be truncated, short or empty.
             names: Names of the columns. Default: the file names of the logs.
 
         Raises:
@@ -163,7 +163,7 @@ class LogComparison(Result):
 
     @property
     def links_differ(self) -> bool:
-        """True if the compared runs had different network links, for example other delays."""
+        """True if the network links of the compared runs differ, for example in their delay."""
         return any(difference.concerns_link for difference in self.differences)
 
     def headline(self) -> str:

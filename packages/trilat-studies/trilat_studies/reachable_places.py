@@ -40,8 +40,9 @@ EndEffector = Callable[[list[float]], Sequence[float]]
 def can_reach(scenario: Scenario, site: str, start_rad: Array, position_m: Array) -> bool:
     """Returns True if a pose was found that places the end effector at a given position.
 
-    For a two-link arm, the link lengths decide. For a chain with more joints, a numerical
-    search within the joint limits decides, and may miss an existing pose.
+    For a two-link arm, the link lengths determine whether there is such a pose. For a chain
+    with more joints, a numerical search looks for a pose within the joint limits, and may miss
+    a pose that exists.
 
     Args:
         scenario: The scenario.

@@ -23,7 +23,7 @@ from .record_batches import RecordBatch
 class Range(NamedTuple):
     """Smallest and largest value of a quantity in part of a run, for comparison with limits.
 
-    For a single-valued quantity, such as a mean, both ends are the same.
+    For a quantity with a single value, such as a mean, `least` and `most` are equal.
     """
 
     least: float
@@ -135,8 +135,8 @@ class WindowStats:
     def compute_ranges(self) -> dict[str, Range]:
         """Returns the smallest and largest value of each quantity within the window.
 
-        Joint angles have distinct extremes. All other quantities, such as a mean or a peak,
-        have a single value, which is used as both ends of the range.
+        For a joint angle, the two values are its extremes. Every other quantity, such as a mean
+        or a peak, has a single value, which is returned as both the smallest and the largest.
 
         Returns:
             The ranges, keyed as in the table [expect]. Empty if the records end before the
@@ -315,7 +315,7 @@ class SiteStats:
 
     @property
     def rms_error_rad(self) -> float:
-        """Root mean square of the error e over all records, in rad, of the worst joint."""
+        """Root mean square of the error e of the worst joint over all records, in rad."""
         records = max(1, self.records)
         mean_square = self._squares.max() / records
         return float(np.sqrt(mean_square))

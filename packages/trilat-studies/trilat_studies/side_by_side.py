@@ -45,16 +45,18 @@ def prepare_kinds(kinds: Mapping[K, RunKind]) -> dict[K, str]:
     """Chooses the kinds of runs to compute side by side, and compiles the code for them.
 
     If the code has not been compiled before, a kind is chosen only if its runs are long enough
-    in total to make the compilation worthwhile. A kind that cannot be computed side by side is
-    also chosen if its runs are just as long, or if another kind in the study is computed side
-    by side, so that the study can report the reason.
+    in total to make the compilation worthwhile.
+
+    The result also contains kinds that cannot be computed side by side, so that the study can
+    report the reason. They are included if their runs would have been long enough, or if
+    another kind is computed side by side.
 
     Args:
         kinds: Kinds of runs, under arbitrary keys.
 
     Returns:
-        For each chosen kind, the reason why its runs are still computed one by one, or an empty
-        string.
+        An empty string for each chosen kind. For each kind that cannot be computed side by
+        side, the reason why its runs are computed one by one.
     """
     several = {key: kind for key, kind in kinds.items() if kind.runs > 1}
     if not several:

@@ -98,8 +98,8 @@ class HaplyInverse3:
         """Waits for the next state of the device: position, velocity and buttons.
 
         Raises:
-            ConnectionError: The service has no device, or has closed the connection.
-            TimeoutError: The service is silent.
+            ConnectionError: The service reports no device, or has closed the connection.
+            TimeoutError: The service sends no state within `SILENCE_S`.
         """
         assert self._socket is not None, "the context has been entered"
         try:
@@ -123,7 +123,7 @@ class HaplyInverse3:
             message: Decoded message from the service.
 
         Raises:
-            ConnectionError: The service has no Inverse3.
+            ConnectionError: The service reports no Inverse3.
         """
         if not message.get("inverse3"):
             raise ConnectionError(f"the service at {self._address} has no Inverse3")
@@ -146,7 +146,7 @@ class HaplyInverse3:
         """Sends a force to the device, which applies it to the person.
 
         The message also requests the next state. Nothing is sent before the first state has
-        arrived, since it contains the identity of the device.
+        arrived, since that state contains the identity of the device.
 
         Args:
             force_n: Force along x, y and z, in N.

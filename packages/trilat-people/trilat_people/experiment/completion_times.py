@@ -36,8 +36,9 @@ SUCCESS = "succeeded"
 class CompletionTime(NamedTuple):
     """Summary of the completion times under one condition.
 
-    Uses medians instead of means, since the completion time of a trial that was not completed
-    is only known to exceed the time limit (censored).
+    Uses medians instead of means, since a trial that was not completed has no completion time
+    (it is censored). It counts as longer than every measured time, so a median or an end of a
+    confidence interval may lie beyond all measured times (not reached).
 
     Attributes:
         condition: Name of the condition.
@@ -157,7 +158,7 @@ def summarise_times(
     """Returns the median completion time under each condition, with a confidence interval.
 
     The median is first taken over the trials of each participant (or pair), and then over the
-    participants. It is `None` if it was not reached because too many trials were not completed.
+    participants. It is `None` (not reached) if too many trials were not completed.
 
     Args:
         rows: Trials as mappings with the keys `condition`, `completion_s`, `succeeded` and the

@@ -219,16 +219,16 @@ def draw_learning(
     unit: str = "participant",
     limit_s: float | None = None,
 ) -> Figure:
-    """Plots how a measure changes from trial to trial of a block, with one line per condition.
+    """Plots how a measure changes over the trials of a block, with one line per condition.
 
     Args:
         rows: One row per trial, as for `statistics`, including `trial`, the position of the
             trial in its block.
         measure: Name of the measure in the rows.
         unit: Unit over which trials are averaged first, "participant" or "pair".
-        limit_s: Time limit of a trial, in s, or `None` if all trials were completed. With a
-            time limit, medians are plotted, and medians above the limit appear as open markers
-            on the limit line.
+        limit_s: Time limit of a trial, in s, if some trials were not completed. Medians are
+            then plotted, and medians above the limit appear as open markers on the limit line.
+            `None` to plot means.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)

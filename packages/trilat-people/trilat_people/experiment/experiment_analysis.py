@@ -134,7 +134,7 @@ class ExperimentAnalysis(Result):
 
     Args:
         experiment: The experiment to analyse.
-        exclude: Mapping from each participant or pair to exclude to the reason.
+        exclude: Participants or pairs to exclude, each mapped to the reason for its exclusion.
 
     Attributes:
         unit: The independently sampled unit, "participant" or "pair".
@@ -368,15 +368,15 @@ class ExperimentAnalysis(Result):
     def of(self, measure: str) -> Sequence[Row]:
         """Returns the rows of the result table that contains a measure.
 
-        Depending on the measure, a row is a trial, a participant or pair, or a completed
-        questionnaire.
+        Depending on the measure, each row describes a trial, a participant or pair, or a
+        completed questionnaire.
 
         Args:
             measure: Name of the measure, such as "completion_s".
 
         Returns:
-            The rows, each a mapping from column name to value. Empty if no questionnaire has
-            the measure.
+            The rows, each a mapping from column name to value. Empty if no table contains the
+            measure.
         """
         rows_by_kind = {
             "throughput": self.throughput_rows,
@@ -708,7 +708,7 @@ class ExperimentAnalysis(Result):
         """Returns all results as plain values for `trilat experiment analyse --json`.
 
         Includes the means of the conditions, their comparisons, completion times, missing
-        answers, fitted models and the facts about the study.
+        answers, fitted models, and facts about the study, such as the control law.
         """
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
@@ -732,8 +732,8 @@ class ExperimentAnalysis(Result):
 
         These are a summary of completed trials, the means and comparisons of the measures, the
         fitted models, the number of missing questionnaire answers, the reasons why a measure
-        has no value, and the facts about the study. With a single participant or pair, there
-        are no comparisons, and all measures are in one table.
+        has no value, and facts about the study, such as the control law. With a single
+        participant or pair, there are no comparisons, and all measures are in one table.
         """
         yield from self._write_time_blocks()
 
@@ -921,7 +921,7 @@ def analyse_experiment(
         folder: Folder of the experiment.
         out: Folder for tables and figures. By default, the subfolder `analysis` of the
             experiment.
-        exclude: Mapping from each participant or pair to exclude to the reason.
+        exclude: Participants or pairs to exclude, each mapped to the reason for its exclusion.
 
     Raises:
         UsageError: There is no experiment, no trial has finished, or an excluded participant or
@@ -993,8 +993,8 @@ class PowerOfExperiment(Result):
     def blocks(self) -> Iterator[str | TextTable]:
         """Yields the parts of the report that `trilat experiment power` prints.
 
-        A table lists the number of participants needed for each power, the probability of
-        detecting a true effect. If a number of participants is planned, a sentence states the
+        A table lists the number of participants needed for each power (the probability of
+        detecting a true effect). If a number of participants is planned, a sentence states the
         resulting power.
         """
         yield (
@@ -1032,7 +1032,7 @@ def compute_experiment_power(
         seed: Seed of the simulated experiments.
 
     Raises:
-        UsageError: The effect needs more participants than `find_least_number` tries.
+        UsageError: Detecting the effect takes more participants than `find_least_number` tries.
     """
     return PowerOfExperiment(effect, participants, seed)
 

@@ -117,7 +117,7 @@ class Experiment(Result):
                 or `None` to open the journal for reading only.
 
         Raises:
-            UsageError: The finished trials are of the other kind.
+            UsageError: The journal already contains trials of the other kind.
         """
         if people is not None:
             entries = self.read_entries().values()
@@ -142,7 +142,7 @@ class Experiment(Result):
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
-        """Returns a mapping from trial number in the plan to the result of each finished trial.
+        """Returns the result of each finished trial, by the number of the trial in the plan.
 
         For example, {1: TrialEntry(...), 2: TrialEntry(...)}. Empty before the first trial.
         """
@@ -167,7 +167,7 @@ class Experiment(Result):
 
         Returns:
             Mapping from the number of the second trial of a pair to the chosen trial, 1 or 2.
-            Empty if there is no staircase. Pairs with no answer are missing.
+            Empty if there is no staircase. Pairs with no answer are left out.
         """
         if self.plan.protocol.staircase is None:
             return {}

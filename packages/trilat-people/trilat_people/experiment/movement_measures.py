@@ -325,8 +325,9 @@ def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
     """Returns the part of two users' forces on an object that cancels out, in N.
 
     Along an axis where the two forces have opposite signs, the smaller force cancels an equal
-    part of the larger one. Otherwise, nothing cancels. The second user's part is minus the
-    first user's. `internal_rms_n` in docs/reference/metrics.md is the RMS of this force.
+    part of the larger one. Otherwise, nothing cancels. The second user's part is the negative
+    of the first user's part. `internal_rms_n` in docs/reference/metrics.md is the RMS of this
+    force.
 
     Args:
         first: Force of the first user on the object, in N, shape (K, D).

@@ -537,10 +537,10 @@ class ExperimentPlan(Result):
         return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
-        """Returns the difference within a pair of trials in a perception test, and the answer.
+        """Returns the difference within a pair of trials, and whether the choice was right.
 
-        A staircase presents pairs of trials that differ in one scenario key, and the
-        participant chooses the trial in which its value was larger.
+        A staircase (a perception test) presents pairs of trials that differ in the value of one
+        scenario key. The participant chooses the trial in which the value was larger.
 
         Args:
             planned: A trial of the pair.
@@ -609,7 +609,7 @@ class ExperimentPlan(Result):
     def list_orders(self) -> dict[str, list[str]]:
         """Returns the order of conditions for each group of participants.
 
-        The order differs between groups because participants improve with practice.
+        The order may differ between groups, because participants improve with practice.
 
         Returns:
             Mapping from group name to the ordered names of the conditions, for example
@@ -628,8 +628,8 @@ class ExperimentPlan(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the report that `trilat experiment check` prints.
 
-        The report states the number of trials, the maximum duration of each, and the order of
-        conditions for each group.
+        The report states the number of trials, the maximum duration of a trial, and the order
+        of conditions for each group.
         """
         protocol = self.protocol
         facts = self.to_dict()

@@ -50,7 +50,8 @@ class Questionnaire(Frozen, frozen=True):
         items: Mapping from item name (as used in the result table) to the text of the item.
         low: Label of the lower end of the scale.
         high: Label of the upper end of the scale.
-        ends: Labels of both ends of the scale, for items that do not use `low` and `high`.
+        ends: Mapping from the name of an item that does not use `low` and `high` to the labels
+            of both ends of its scale.
         least: Smallest value of the scale.
         most: Largest value of the scale.
         step: Step between two values of the scale.

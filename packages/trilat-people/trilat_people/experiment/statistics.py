@@ -260,9 +260,10 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
 
 
 class Comparison(NamedTuple):
-    """Within-unit comparison of a measure between two conditions.
+    """Comparison of a measure between two conditions, within participants or pairs.
 
-    The interval, tests and effect sizes are `None` for fewer than two units.
+    The values are compared within each unit, which is a participant or a pair. The interval,
+    tests and effect sizes are `None` for fewer than two units.
 
     Args:
         measure: Name of the measure.
@@ -629,14 +630,14 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
 
     Args:
         d_z: Effect size: mean of the differences divided by their standard deviation.
-        number: Number of units.
+        number: Number of participants (or pairs).
         alpha: Significance level.
 
     Returns:
         The power, between 0 and 1.
 
     Raises:
-        UsageError: There are fewer than two units, or alpha is not between 0 and 1.
+        UsageError: `number` is less than two, or `alpha` is not between 0 and 1.
     """
     if number < 2 or not 0.0 < alpha < 1.0:
         raise UsageError(
@@ -665,10 +666,11 @@ def find_least_number(
         d_z: Effect size: mean of the differences divided by their standard deviation.
         wanted: Desired power, between 0 and 1.
         alpha: Significance level.
-        most: Largest number of units to try.
+        most: Largest number of participants (or pairs) to try.
 
     Raises:
-        UsageError: More than `most` units are needed, or `wanted` is not between 0 and 1.
+        UsageError: More than `most` participants (or pairs) are needed, or `wanted` is not
+            between 0 and 1.
     """
     if not 0.0 < wanted < 1.0 or power(d_z, most, alpha=alpha) < wanted:
         raise UsageError(

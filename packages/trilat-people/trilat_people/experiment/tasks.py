@@ -57,8 +57,8 @@ class _TrialTask(Frozen, frozen=True, tag_field="kind"):
     def longest_s(self) -> float:
         """Longest duration of a trial after its target has appeared, in s.
 
-        With a time limit (`has_limit`), a trial that has not succeeded by then has failed.
-        Otherwise, every trial lasts exactly this long.
+        If the task has a time limit (`has_limit`), a trial that has not succeeded within this
+        time fails. Otherwise, every trial lasts exactly this long.
         """
         raise NotImplementedError
 
@@ -80,7 +80,7 @@ class _TrialTask(Frozen, frozen=True, tag_field="kind"):
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
-        """Creates the goal of one trial: its target, and the rule for when it ends.
+        """Creates the goal of one trial: its target, and the rule for ending the trial.
 
         Args:
             start_m: Start position of the slave's end effector, in m, shape (2,) or (3,).
@@ -91,7 +91,7 @@ class _TrialTask(Frozen, frozen=True, tag_field="kind"):
 
 
 class TrialGoal:
-    """Target of one trial, and the rule that decides when the trial ends.
+    """Target of one trial, and the rule that determines when the trial ends.
 
     Args:
         start_m: Start position of the slave's end effector, in m.
@@ -224,7 +224,7 @@ class TrialGoal:
 
 
 class Outcome(NamedTuple):
-    """Result of a completed trial.
+    """Result of a trial that has ended.
 
     Attributes:
         succeeded: True if the task was completed. False if the time limit was reached or a rule
@@ -282,8 +282,9 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
     def render_instructions(self, slave: str) -> str:
         """Returns the instructions shown to participants for a reaching trial.
 
-        If the task has these rules, the instructions state how far the arm may leave the
-        straight path to the target and when the other user takes over.
+        If the task has a corridor, the instructions state how far the arm may leave the
+        straight path to the target. If it has a handover, they state when the other user takes
+        over.
 
         Args:
             slave: Name of the slave arm to use in the instructions.
@@ -507,7 +508,7 @@ class _ReachGoal(_DwellGoal):
 
 
 class ContactTrial(_TrialTask, frozen=True, tag="contact"):
-    """Task: press against a wall with a given force and hold it for some time.
+    """Task: press against a wall with a given force, and hold this force for some time.
 
     Attributes:
         axis: Index of the axis of the arm's base frame along which the target is placed,
@@ -540,7 +541,7 @@ class ContactTrial(_TrialTask, frozen=True, tag="contact"):
     def longest_s(self) -> float:
         """Time limit of a trial, in s.
 
-        A trial has failed if the force has not been held by then.
+        A trial fails if the force has not been held for `dwell_s` within this time.
         """
         return self.timeout_s
 
@@ -632,7 +633,7 @@ class TrackTrial(_TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """Always False: following a target takes exactly `duration_s` and cannot fail."""
+        """Always False: a tracking trial lasts exactly `duration_s` and cannot fail."""
         return False
 
     @property

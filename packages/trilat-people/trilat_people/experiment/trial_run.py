@@ -143,7 +143,7 @@ class ExperimentTrial:
         planned: The argument of the same name.
         slave: Name of the slave in the scenario.
         arm: Model of the slave arm.
-        scenario: Scenario of this trial, whose duration is the longest that the trial may take.
+        scenario: Scenario of this trial. Its duration is the longest that the trial may take.
         appears_s: Time at which the target appears, in s.
         longest_s: Latest possible end of the trial, in s.
     """
@@ -214,8 +214,8 @@ class ExperimentTrial:
         def divide_shares(lead: float) -> dict[str, float]:
             """Returns the dominance factors of the slave for this trial.
 
-            The sum of both users' factors is that of the scenario: if it is 1, lead = 0.7 gives
-            0.7 and 0.3.
+            The factors of the two users add up to the same sum as in the scenario. If this sum
+            is 1, lead = 0.7 gives the factors 0.7 and 0.3.
 
             Args:
                 lead: First user's share of the authority over the slave, between 0 and 1. The
@@ -275,10 +275,10 @@ class ExperimentTrial:
         return magnitude_n
 
     def make_goal(self) -> TrialGoal:
-        """Creates the goal of the trial: its target, and the rule for when it ends.
+        """Creates the goal of the trial: its target, and the rule for ending the trial.
 
-        A goal stores when the end effector entered the target, so each judge of the trial needs
-        its own goal.
+        A goal stores when the end effector entered the target, so each `TrialJudge` needs a
+        goal of its own.
         """
         planned = self.planned
         task = self.protocol.task
@@ -610,8 +610,8 @@ class SyntheticTrial(ExperimentTrial):
     def write(self, path: Path) -> TrialEntry:
         """Simulates the trial, writes its log and returns its result.
 
-        A first run with no log determines when the trial ends, so the log stops shortly
-        afterwards.
+        A first run with no log determines when the trial ends, so that the run with the log can
+        stop shortly afterwards.
 
         Args:
             path: Path of the log.

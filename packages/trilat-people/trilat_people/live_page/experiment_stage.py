@@ -45,7 +45,7 @@ Json = dict[str, Any]
 class TrialWatch:
     """Decides during a trial whether it succeeds, fails or must be repeated.
 
-    The pages call `poll` many times per second while the session runs.
+    `poll` must be called many times per second while the session runs.
 
     Args:
         trial: The trial, with its task and the names of its sites.
@@ -84,7 +84,7 @@ class TrialWatch:
         """Judges the trial from new records of the slave arm, and detects reasons to repeat it.
 
         The trial must be repeated if an arm was stopped, or if the web page of a participant
-        has disappeared. In that case, the records are not judged.
+        has been missing for too long. In these cases, the records are not judged.
 
         Args:
             view: Current state of the session.

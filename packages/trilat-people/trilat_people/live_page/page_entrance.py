@@ -29,14 +29,14 @@ MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
 
 
 class Strangers:
-    """Open connections whose role is not known yet.
+    """Open connections for which the role of the user is not known yet.
 
     Their number is limited. If there are too many, the oldest is closed, so nobody can block
     others with many silent connections.
 
     Args:
-        refused: Mapping from reason to number of refusals, which also counts the connections
-            closed because there are too many.
+        refused: Mapping from reason to number of refusals. Connections that are closed because
+            there are too many are counted as well.
     """
 
     def __init__(self, refused: Counter[str]) -> None:
@@ -47,11 +47,11 @@ class Strangers:
     def add(self, connection: ServerConnection) -> None:
         """Adds a new connection, closing and counting the oldest one if there are too many.
 
-        The oldest connection has had the most time to prove its role. Closing it prevents a
-        flood of connections from blocking new ones.
+        The user of the oldest connection has had the most time to open a page. Closing this
+        connection prevents a flood of connections from blocking new ones.
 
         Args:
-            connection: The new connection, whose role is not known yet.
+            connection: The new connection, for which the role of the user is not known yet.
         """
         if len(self._connections) >= MAX_STRANGERS:
             oldest = next(iter(self._connections))
@@ -61,9 +61,9 @@ class Strangers:
         self._connections[connection] = None
 
     def remove(self, connection: ServerConnection) -> None:
-        """Removes a connection that was closed or whose page has proved its role.
+        """Removes a connection that was closed, or through which a page was opened.
 
-        Does nothing if the connection is not a stranger.
+        Does nothing if the connection was removed before.
         """
         self._connections.pop(connection, None)
 

@@ -130,7 +130,7 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
     """Request from a page to stop all arms immediately. Anybody may send it, even a watcher.
 
-    The session continues, and the arms rest until somebody releases them.
+    The session continues, and the arms remain stopped until somebody releases them.
     """
 
 
@@ -340,8 +340,8 @@ class Role:
     def may(self, message: PageMessage) -> bool:
         """Returns True if a person with this role may send a message.
 
-        An experimenter may send every message. A user may move their own arm, and reply in an
-        experiment. Everybody may stop the arms.
+        An experimenter may send every message. A user may move the arm of the user's site, and
+        send replies in an experiment. Everybody may stop the arms.
 
         Args:
             message: The message from the person's web page.
@@ -567,13 +567,13 @@ class OrderDesk:
         first_site: str,
         source: str = "",
     ) -> None:
-        """Queues a page's request to change the session, move arms, or mark a moment.
+        """Queues a page's request to change settings, release arms, or mark a moment.
 
         Args:
             order: The request.
             sites: Names of the sites of the session, empty until all of them run.
             links: Names of the links of the session.
-            first_site: Site that publishes marks. Empty while the scenario is not yet known.
+            first_site: Site that publishes the mark. Empty while the scenario is not yet known.
             source: Sender of the request, as recorded in log events.
         """
         if isinstance(order, _SetLink | _SetShares):
@@ -621,7 +621,7 @@ class OrderDesk:
         self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
-        """Asks sites to stop immediately, ahead of all waiting requests.
+        """Asks sites to stop their arms immediately, ahead of all waiting requests.
 
         Waiting requests that would release the same arms are withdrawn.
 

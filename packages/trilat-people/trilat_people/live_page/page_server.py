@@ -141,7 +141,7 @@ class _Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Counts a new connection as a stranger until its page has proved its role.
+        """Adds a new connection to `strangers`, the connections that have no page yet.
 
         Args:
             transport: The connection.
@@ -150,7 +150,7 @@ class _Visitor(ServerConnection):
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Removes a closed connection from the strangers.
+        """Removes a closed connection from `strangers`, the connections that have no page yet.
 
         Args:
             exc: Error that closed the connection, or `None` if it was closed normally.
@@ -161,8 +161,8 @@ class _Visitor(ServerConnection):
     def data_received(self, data: bytes) -> None:
         """Processes data from the browser, and records that this connection has sent data.
 
-        Browsers open some connections in advance and close them unused. The record
-        distinguishes these from connections whose data were not a valid request.
+        Browsers open some connections in advance and close them unused. Since they send no
+        data, they can be distinguished from connections that sent an invalid request.
 
         Args:
             data: The bytes received.
@@ -705,8 +705,8 @@ class PageServer:
     async def _serve_page(self, connection: ServerConnection) -> None:
         """Exchanges messages with one page until its connection is closed.
 
-        The page of a user may move the user's arm immediately. The page of an experimenter
-        controls the session unless another experimenter's page already does.
+        A user may move the arm of the user's site immediately. An experimenter's page controls
+        the session unless another experimenter's page already does.
         """
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
@@ -886,7 +886,7 @@ class PageServer:
     def experimenters(self) -> set[_Page]:
         """Open web pages of experimenters.
 
-        Of these pages, those with `takes_part` set control the session.
+        A page controls the session only if its attribute `takes_part` is True.
         """
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 

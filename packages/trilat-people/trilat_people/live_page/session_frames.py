@@ -172,7 +172,8 @@ class _ArmFrames:
         """Computes the end points of the arm's links before the first control period.
 
         Returns:
-            The pose in the format of `describe_pose`, with tick -1 and no bodies.
+            The pose in the format of `describe_pose`, with tick -1 and an empty list for the
+            bodies that the arm can touch.
         """
         q0 = np.array(self._spec.q0_rad, dtype=np.float64)
         pose = self.describe_pose(q0)

@@ -191,7 +191,10 @@ class SiteView:
 
     @property
     def ended(self) -> bool:
-        """True once the site has published its end, after which it sends no more records."""
+        """True once the site has published its `end` event.
+
+        The site sends no more records after this event.
+        """
         return self.repair.reception.final_ticks is not None
 
     @property
@@ -271,8 +274,8 @@ class SessionView:
     def ended(self) -> bool:
         """True once there is nothing more to observe.
 
-        This is the case if every site has published its end or has left the network, or if
-        `finish` was called. A session that has not started has not ended.
+        This is the case if every site has published its `end` event or has left the network, or
+        if `finish` was called. A session that has not started has not ended.
         """
         if not self.running:
             return False

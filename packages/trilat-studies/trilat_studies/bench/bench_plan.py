@@ -368,7 +368,7 @@ With equal durations, a law whose arms come to rest slowly would appear to be un
 
 
 class TunedGains(msgspec.Struct, frozen=True):
-    """Gains of a control law, tuned for one kind of scenario and one network round trip.
+    """Gains of a control law, tuned for one kind of scenario and one round-trip time.
 
     The tuning tries `tried` candidates. Of those that come to rest at the pose of the task even
     when delays grow by the factor `TUNING_MARGIN`, it selects the one with the smallest error.
@@ -474,8 +474,8 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     """Returns a digest of everything that determines the tuned gains of a law.
 
     The digest covers the scenario, the error and effort of the law in a test run, the ranges in
-    which the gains are searched, and the tuning procedure. A different fingerprint on stored
-    gains means that they were tuned for another experiment or another version of the law.
+    which the gains are searched, and the tuning procedure. Stored gains with a different
+    fingerprint were tuned for another experiment or another version of the law.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
@@ -507,10 +507,10 @@ def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains
 
 
 def choose_round_trip(mean_ms: float) -> int:
-    """Selects the tuned round trip, in ms, whose gains a link should use.
+    """Selects the round-trip time whose tuned gains a link should use, in ms.
 
-    This is the shortest tuned round trip that is at least as long as the mean round trip of the
-    link, or the longest tuned one if all are shorter.
+    This is the shortest round-trip time with tuned gains that is at least as long as the mean
+    round trip of the link, or the longest if all of them are shorter.
 
     Args:
         mean_ms: Mean round trip of the link, in ms.
@@ -891,8 +891,8 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
         - "-" if the task needs two users and the scenario has only one.
         - "no handover" if one user hands over control to the other in this task and the law
           cannot change the users' shares.
-        - "exact model" if the gravity parameters are wrong in this task and the law uses the
-          exact model of the arm instead.
+        - "exact model" if this task gives the law wrong gravity parameters, but the law always
+          uses the exact model of the arm.
         - `NO_GAINS` otherwise, which means that the tuning found no stable gains for the law.
     """
     bench_task = TASKS[task]

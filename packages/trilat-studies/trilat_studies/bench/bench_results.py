@@ -48,8 +48,8 @@ def name_run(key: str, to_s: float) -> str:
 
     Args:
         key: Key of the cell, see `BenchCell.key`.
-        to_s: Duration of the runs, in s, if they repeat first runs over a longer time. It
-            becomes part of the name. 0 for the first runs.
+        to_s: Duration of the runs, in s, if they repeat earlier runs for longer. It becomes
+            part of the name. 0 for runs that are not repetitions.
     """
     return f"{key} to {to_s:g} s" if to_s else key
 
@@ -71,11 +71,12 @@ class BenchRun(msgspec.Struct, frozen=True):
         behaviour: How the run ended, for example at rest or diverged.
         text: Explanation of the verdict.
         length_s: Duration of the judged run, in s.
-        to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
-            for a first run.
-        at_limit: True if the run would have needed more ticks than the safety limit allows.
-        confirmed: True if the repeated run was not stable either, False if the repeated run was
-            stable and so refuted the first one. `None` if there was no repetition, because the
+        to_s: Requested duration in s, if this run repeats an earlier run that was not stable. 0
+            for a run that is not a repetition.
+        at_limit: True if a reliable verdict would have taken more ticks than the safety limit
+            allows.
+        confirmed: True if the repeated run was not stable either, False if its verdict was
+            better and so refuted the first one. `None` if there was no repetition, because the
             first run diverged or was not judged "not stable".
         bounded: True if no joint exceeded the velocity `BOUND_RAD_S` or moved more than
             `THROWN_RAD` away from its start.
@@ -136,8 +137,8 @@ class BenchRun(msgspec.Struct, frozen=True):
     def needs_confirmation(self) -> bool:
         """True if this run was judged not stable, but might be stable over a longer time.
 
-        False for a run that diverged, since a longer run would end at the same time, and for a
-        run that is itself a repetition.
+        False for a run that diverged, since a longer run would diverge at the same time, and
+        for a run that is itself a repetition.
         """
         diverged = self.behaviour is EndBehaviour.DIVERGED
         is_first = not self.to_s

@@ -108,8 +108,8 @@ class BenchRunItem(NamedTuple):
     Attributes:
         cell: The task, control law and link of the run, with the tuned gains.
         seed: Random seed of the run.
-        to_s: Duration of the repetition, in s, if the run repeats a first run over twice its
-            length to check that it is not stable. 0 for a first run.
+        to_s: Duration in s, if this run repeats an earlier run for twice as long to confirm
+            that it is not stable. 0 for a run that is not a repetition.
         is_side_by_side: True to compute the run together with others, if possible.
     """
 
@@ -148,7 +148,7 @@ class JudgedRun(NamedTuple):
         roots: Characteristic roots of the loop at the end of the run.
         stability: The verdict.
         text: Explanation of the verdict.
-        at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks.
+        at_limit: True if a reliable verdict would have taken more than `MAX_RUN_TICKS` ticks.
         rests_on: Evidence for the verdict, as in the stability certificate.
     """
 
@@ -453,9 +453,9 @@ def find_least_energy(records: dict[str, RecordBatch]) -> float:
     (the records contain it with the opposite sign), and qd_i is the joint velocity of the arm,
     in rad/s.
 
-    All arms start at rest. If network and controllers are passive, the arms cannot return more
-    energy than they received, so the net energy never falls below 0 except for numerical
-    errors. A negative result shows that energy was generated.
+    All arms start at rest. If the network and the controllers are passive, the arms cannot
+    return more energy than they received, so the net energy never falls below 0 except for
+    numerical errors. A negative result shows that energy was generated.
 
     Args:
         records: All records of the run, by the name of the arm.
@@ -890,7 +890,7 @@ def run_bench(
         The results of all runs.
 
     Raises:
-        RunFailed: A run ended its worker process, or the connection to the cluster is lost.
+        RunFailed: A worker process died during a run, or the connection to the cluster is lost.
             Finished runs are kept in the journal.
     """
     plan = folder.plan

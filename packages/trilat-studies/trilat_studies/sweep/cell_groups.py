@@ -45,8 +45,9 @@ class CellGroups(NamedTuple):
         """Groups the cells of a sweep by the structure of their scenarios.
 
         Each axis is examined with all other axes at their first values. To limit the cost for
-        large grids, at most 32 values per axis are loaded. If their structures differ and the
-        axis has further values, every value of that axis becomes a group of its own.
+        large grids, scenarios are loaded for at most 32 values per axis. If their structures
+        differ and the axis has further values, every value of that axis becomes a group of its
+        own.
 
         Args:
             plan: The sweep.

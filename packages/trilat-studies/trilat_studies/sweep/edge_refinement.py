@@ -36,8 +36,8 @@ class EdgeRefinement:
     `find_next_cells` and passes the results to the next call, until no more cells are returned.
 
     Args:
-        plan: The sweep. Its attribute `refine` is the number of times that the boxes along the
-            edge are halved.
+        plan: The sweep. Its attribute `refine` is the number of times that the distance between
+            grid points is halved near the edge.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
@@ -97,7 +97,7 @@ class EdgeRefinement:
 
     @staticmethod
     def choose_side(*, stable: int, decided: int) -> int:
-        """Classifies a cell as stable, unstable or undecided by a majority of its runs.
+        """Classifies a cell as stable, unstable or undecided by the majority of its runs.
 
         Args:
             stable: Number of stable runs of the cell.

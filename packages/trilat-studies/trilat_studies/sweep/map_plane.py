@@ -121,7 +121,7 @@ class PlaneAxis(NamedTuple):
         return borders
 
     def keep_columns(self) -> FineColumns:
-        """Returns only the columns of the map, for theoretical lines with no other points."""
+        """Returns only the map's own columns, for lines that are not computed elsewhere."""
         count = len(self.values)
         return FineColumns(self.values, tuple(self.positions.tolist()), tuple(range(count)))
 
@@ -165,7 +165,7 @@ class PlaneAxis(NamedTuple):
         )
 
     def thin_out(self, halvings: int) -> "PlaneAxis":
-        """Returns the axis values in the coarse grid with which a refined sweep begins.
+        """Returns the axis with only the values of the coarse grid that a sweep refines.
 
         Args:
             halvings: Number of times that the refined sweep halves its grid. If 0, the whole
@@ -184,9 +184,10 @@ class MapPanel(NamedTuple):
     Any further swept keys have the same values for all runs of a panel.
 
     Attributes:
-        title: The values of these keys as a string, such as "p d, delay 200 ms". Empty if there
-            are no such keys.
-        settings: The same as pairs of a key and a value. The key of a swept law is "law".
+        title: The values of the further swept keys as a string, such as "p d, delay 200 ms".
+            Empty if there are no further keys.
+        settings: The further swept keys with their values, as pairs. The key of a swept law is
+            "law".
         counts: Number of runs for each grid point and class, shape (y, x, 4). The classes are
             in the order of `CELL_CLASSES`.
         exponents_per_s: Growth exponent of each grid point (the rate at which a small
@@ -243,8 +244,8 @@ class MapPanel(NamedTuple):
     def fill_gaps(self) -> "MapPanel":
         """Fills in the grid points that a refined sweep did not run, for drawing the map.
 
-        Such a point gets the class of the nearest point that was run. Growth exponents are
-        interpolated linearly between grid points that have one.
+        Each of these points gets the class of the nearest point that was run. Growth exponents
+        are interpolated linearly between grid points that have one.
         """
         from scipy.interpolate import griddata
         from scipy.ndimage import distance_transform_edt

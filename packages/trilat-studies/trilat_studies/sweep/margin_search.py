@@ -62,8 +62,8 @@ class KeyMargin(NamedTuple):
     Attributes:
         spans: The edges in ascending order. There may be several, for example if stability is
             lost at one value and regained at a larger value.
-        stable: If there are no edges, True if all decided values are stable, and False if no
-            value is stable. `None` if there are edges, or if no value was decided.
+        stable: If there are no edges, True if all runs with a verdict are stable, and False if
+            none of them is. `None` if there are edges, or if no run has a verdict.
         undecided: Number of values at which the stability of the run remained undecided.
         runs: Number of values at which the scenario was run.
     """
@@ -274,7 +274,7 @@ class _MarginItem(NamedTuple):
 class GridPointMargin(NamedTuple):
     """Stability edges along one scenario key, at one grid point of a sweep.
 
-    A grid point is a combination of the other swept parameters.
+    A grid point is a combination of values of the other swept parameters.
 
     Attributes:
         cell: The grid point.
@@ -362,7 +362,7 @@ def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
 class SweepMargins(Result):
     """Stability edges along one scenario key, for each grid point and random seed of a sweep.
 
-    A grid point is a combination of the other swept parameters.
+    A grid point is a combination of values of the other swept parameters.
 
     Attributes:
         plan: The sweep. Its last axis is the searched key with two values, the ends of the
@@ -386,8 +386,8 @@ class SweepMargins(Result):
     ) -> "SweepMargins":
         """Finds the stability edges along one scenario key, at each grid point of a sweep.
 
-        A grid point is a combination of the other swept parameters. An edge is a value of the
-        searched key at which runs change from stable to not stable or back.
+        A grid point is a combination of values of the other swept parameters. An edge is a
+        value of the searched key at which runs change from stable to not stable or back.
 
         Args:
             plan: The sweep. Its last axis must be the searched key with two values, the ends of

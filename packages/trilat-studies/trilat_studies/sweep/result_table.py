@@ -67,7 +67,7 @@ def encode_table(
 class ResultTable:
     """Columns of a sweep's results.csv, for writing and reading its rows.
 
-    The columns depend on the sweep, since there is one per swept parameter.
+    The columns depend on the sweep, because each swept parameter has a column.
 
     Args:
         plan: The sweep.
@@ -98,7 +98,9 @@ class ResultTable:
         return {**row, _SCENARIO_COLUMN: json.dumps(changes, ensure_ascii=False)}
 
     def parse(self, line: Mapping[str, str]) -> ResultRow:
-        """Converts one line of the CSV table to a row, with the full text of the scenario.
+        """Converts one line of the CSV table to a row, and restores the text of its scenario.
+
+        To save space, the table contains only the differences from the swept scenario.
 
         Args:
             line: Mapping from column name to the string in the file.

@@ -55,10 +55,10 @@ class MapLine(NamedTuple):
         excess: The quantity at the grid points, shape (number of y values, number of x values).
             Positive on the stable side, NaN where it is unknown.
         rank: Index of the line style. -1 is the style of measured lines.
-        fine_positions: Positions along x of the columns between which the line is drawn. Empty
-            if these are the columns of the map.
-        fine_excess: The quantity at these columns, shape (number of y values, number of
-            columns).
+        fine_positions: Positions along x of all columns at which the line was computed. Empty
+            if the line was computed only at the columns of the map.
+        fine_excess: The quantity at these positions, shape (number of y values, number of
+            positions).
     """
 
     label: str
@@ -71,15 +71,18 @@ class MapLine(NamedTuple):
 
     @property
     def drawn_excess(self) -> Array:
-        """Values, at each column, of the function whose zero crossing is the line.
+        """Values of the quantity whose zero contour is drawn as the line.
 
-        The columns are the fine ones if the line was computed there, and the columns of the map
-        otherwise.
+        These are `fine_excess` if the line was computed between the columns of the map, and
+        `excess` otherwise.
         """
         return self.fine_excess if self.fine_positions else self.excess
 
     def thin_out(self, columns: FineColumns) -> "MapLine":
-        """Separates a theoretical line's values at the map's columns from those at all columns.
+        """Returns the line with its values at the map's columns separated from all its values.
+
+        `excess` of the result contains only the values at the map's columns, and `fine_excess`
+        contains the values at all columns at which the line was computed.
 
         Args:
             columns: The columns at which the line was computed.
@@ -96,8 +99,8 @@ class MapLine(NamedTuple):
     def crosses_map(self) -> bool:
         """True if the line passes between grid points of the map and is therefore visible.
 
-        This requires four neighbouring grid points at which the quantity is known and positive
-        at some but not all of them.
+        This requires four neighbouring grid points at which the quantity is known. It must be
+        positive at some of these points, but not at all of them.
         """
         excess = self.drawn_excess
         lower = excess[:-1]
@@ -197,8 +200,8 @@ class MapLine(NamedTuple):
 
         On this line, small motions neither grow nor decay: the real part of the rightmost
         characteristic root is zero. The quantity of the line (see `MapLine.excess`) is the
-        decay rate of the motions in 1/s, the negative of the growth rate, which is positive on
-        the stable side.
+        decay rate of the motions in 1/s, that is, the growth rate with the opposite sign. The
+        decay rate is positive on the stable side.
 
         Args:
             columns: Linear analysis of each column of the panel, in the order of x, with growth
