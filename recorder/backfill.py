@@ -71,8 +71,8 @@ class _OpenRequest(NamedTuple):
 class GapRepair:
     """Requests messages that were lost on the network from the site that sent them.
 
-    A site keeps its recent messages in a buffer for this purpose. Each object serves one start
-    of a site.
+    A site keeps its recent messages in a buffer for this purpose. Each object handles one start
+    of the site's process.
 
     Args:
         bus: Network connection of the recorder.

@@ -92,8 +92,9 @@ class Recorder:
         provenance: Information about this program that is stored in the log.
         stopped: Function that returns True if the recorder must end at once.
         say: Function that prints a line for the user.
-        is_ending: Function that returns True if the recorder must end once it has the messages
-            that the sites still have, or after `END_NS`.
+        is_ending: Function that returns True if the recorder must end as soon as it has the
+            messages that the sites still store. It stops waiting for them if none arrives for
+            `END_NS`, and at the latest after `LONGEST_END_NS`.
     """
 
     def __init__(
@@ -371,7 +372,7 @@ def record_session(
         say: Function that prints a line for the user.
         afterwards: Function that processes the finished log, unless the recorder was
             interrupted. The recorder remains a member of the session until this function
-            returns, and sites with `--stay` wait for that.
+            returns, and sites that were started with `--stay` wait until then.
         warn: Function that is called when the connection is open, to warn the user of risks.
 
     Returns:

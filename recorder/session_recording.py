@@ -503,10 +503,11 @@ class Recording:
         The network announces each start of a site with a token, which disappears with the
         process.
 
-        A token may belong to a start other than the one being recorded: an earlier one, or one
-        that may be recorded later. It does not affect the recorded start. Its disappearance is
-        noted anyway, since the other start may be recorded later and the network will not
-        report the disappearance again (`_admit_starts`). The number of such notes is limited.
+        A token may belong to a start other than the one being recorded, either an earlier or a
+        later start. A token of another start does not affect the recorded one. Its
+        disappearance is noted anyway, because that start may be recorded later, and the network
+        will not report the disappearance again (`_admit_starts`). The number of these notes is
+        limited.
 
         Args:
             key: Key of the token, which contains the name of the site and the boot (the random
@@ -611,8 +612,8 @@ class Recording:
 
         - The site has left, and no more messages are expected from it (`_has_left`).
         - The site is running and sending messages, whose numbers show which messages are
-          missing. If there are no gaps `SETTLE_NS` after the recorder was told to end, the
-          messages that were in transit at that time have arrived.
+          missing. `SETTLE_NS` after the recorder was told to end, all messages that were in
+          transit when it was told have either arrived or left gaps.
         - Otherwise, the site has ended or is silent, but has not left. It may have sent
           messages unknown to the recorder, or the last check of its messages may still be
           pending. The recorder then waits until the site is running again or has left.
@@ -663,7 +664,7 @@ class Recording:
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
         """Formats the numbers of received and missing messages for storage in the log.
 
-        They show a reader of the log whether it is complete.
+        The numbers show a reader of the log whether the log is complete.
 
         Args:
             queue: Queue of the received messages, which counts those that it could not hold.
@@ -729,7 +730,7 @@ class Recording:
         return line
 
     def describe_problem(self) -> str | None:
-        """Returns the first problem of the recording, which becomes the recorder's error.
+        """Describes the first problem of the recording, for the recorder's final error.
 
         The recorder ends with an error if the log is incomplete, so that nobody uses an
         incomplete log unknowingly.
@@ -812,8 +813,8 @@ class RecorderReport:
     def publish(self) -> None:
         """Publishes the statistics of the recording now, and also writes them to the log.
 
-        They show losses during the session, and to readers of the log afterwards. The longest
-        duration of a flush is reset for the next statistics.
+        The statistics reveal losses, both during the session and to later readers of the log.
+        The longest duration of a flush is reset for the next statistics.
         """
         payload = encode(self._make_stats())
         self._flush_max_ns = 0

@@ -215,7 +215,7 @@ class SiteReception:
     Attributes:
         name: Name of the site.
         accounts: Counts of the messages of each channel. Records and statistics are counted
-            over all starts, and events from 0 for every start.
+            across all starts, whereas the count of events begins at 0 with every start.
         event_accounts: Counts of the events of the previous starts.
         skipped_ticks: Number of ticks that the site skipped, over all starts. They are counted
             as unpublished in the account of the records.
@@ -542,8 +542,8 @@ class SiteReception:
         """Registers that a site has published at least a given number of messages on a channel.
 
         Expected messages that have not been received count as missing. Since a faulty site
-        could report any number, the number is limited to what is possible in the scenario by
-        now.
+        could report any number, the number is limited to the largest number that is possible in
+        the scenario by now.
 
         Args:
             channel: Name of the channel.

@@ -69,7 +69,8 @@ class ChangeServer:
 
     Attributes:
         stopped: True if the next tick is the last one before a requested end of the run.
-        marks: Marks that have not been published yet, as pairs of tick and text.
+        marks: Marks (notes for the log) that have not been published yet, as pairs of tick and
+            text.
         sources: Mapping from each accepted change, as written in the record of the tick, to the
             name of its requester. An entry is removed when the change is published.
     """

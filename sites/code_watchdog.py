@@ -198,10 +198,10 @@ class WatchedCode:
         """Interrupts user code that does not return, such as a law with an endless loop.
 
         A timer signal calls this method every second (`_CHECK_S`) while the code runs. If
-        several consecutive checks see the same call, an error is raised inside the call;
-        otherwise the arm would never receive another torque. A call is identified by the number
-        of calls completed before it. Checks that were missed while the process was suspended do
-        not count.
+        several consecutive checks see the same call, an error is raised inside the call,
+        because otherwise the arm would never receive another torque. A call is identified by
+        the number of calls completed before it. Checks that were missed while the process was
+        suspended do not count.
 
         Raises:
             Exception: The error returned by the constructor's argument `fail`.

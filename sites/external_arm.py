@@ -333,10 +333,10 @@ class DeadManSwitch:
 
     A person holds the switch while the arm may move. Releasing it stops the arm.
 
-    The arm stops if any program that holds the switch releases it or falls silent. The others
-    then have to release the switch and press it again. The age of a report is measured from its
-    arrival, on the clock of this machine, so the switch counts as released if this process was
-    suspended.
+    Each program reports whether its user holds the switch. The arm stops if any user releases
+    the switch, or if the reports that it is held stop arriving. All other users then have to
+    release the switch and press it again. The age of a report is measured from its arrival, on
+    the clock of this machine, so the switch counts as released if this process was suspended.
 
     Args:
         site: Name of the site of the arm.
@@ -363,8 +363,8 @@ class DeadManSwitch:
     def _list_holders(self) -> list[_Holder]:
         """Lists the programs whose dead-man switch is pressed and counts as held.
 
-        After any program has released the switch, all programs must release it and press it
-        again, so that nobody restarts an arm by accident.
+        After any user has released the switch, all users must release it and press it again, so
+        that nobody restarts an arm by accident.
         """
         return [
             program
@@ -395,8 +395,8 @@ class DeadManSwitch:
     def poll(self) -> None:
         """Receives reports about the dead-man switch, and updates whether it is held.
 
-        If a program that holds the switch has been silent for too long, it may have crashed,
-        and the switch counts as released.
+        If a program that reported a held switch sends no more reports, it may have crashed, and
+        the switch counts as released.
         """
         while (message := self._ring.poll()) is not None:
             payload, received_ns = message
@@ -428,12 +428,12 @@ class DeadManSwitch:
     def _release(self, released: Sequence[_Holder]) -> None:
         """Marks the dead-man switch of the arm as released, which stops the arm.
 
-        Programs that still hold the switch must release it and press it again. This prevents
+        Users who still hold the switch must release it and press it again. This prevents
         anybody from accidentally restarting an arm that somebody else has stopped.
 
         Args:
-            released: The programs that have released the switch or are silent. If empty,
-                nothing changes.
+            released: The programs whose users have released the switch, or whose reports have
+                stopped. If empty, nothing changes.
         """
         if not released:
             return
@@ -446,11 +446,11 @@ class DeadManSwitch:
     def _accept(self, payload: bytes, received_ns: int) -> None:
         """Checks one report from a program, and updates whether that program holds the switch.
 
-        Several programs may report about the switch of one arm. If one of them releases it, the
-        switch is released, and the others must release it and press it again before they count
-        as holding it. A report names its site, the boot of the program (a random number that
-        identifies the start of its process), and a sequence number n, which the program
-        increases.
+        Several programs may report about the switch of one arm. If one user releases the
+        switch, it counts as released, and the users of the other programs must release it and
+        press it again before they count as holding it. A report names its site, the boot of the
+        program (a random number that identifies the start of its process), and a sequence
+        number n, which the program increases.
 
         Args:
             payload: The encoded report.

@@ -52,7 +52,8 @@ _VIEWS_KEPT = 64
 class HandProcess(SiteClient):
     """Runs a user's operator class, and connects it to the arm that it moves.
 
-    The caller calls `serve` repeatedly. Each call replies to one view sent by the site.
+    The caller calls `serve` repeatedly. Each call replies to one view: the state of the arm and
+    of its peers, as sent by the site.
 
     Args:
         hand_site: Site whose arm the operator moves, and settings of the user's class.

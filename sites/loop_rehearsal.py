@@ -91,7 +91,7 @@ class _Rehearsal(LoopStats):
         Called by the loop in place of `LoopStats.count_tick`.
 
         Args:
-            late_us: Time by which the tick began late, in us.
+            late_us: How late the tick began, in us.
             busy_us: Computing time of the previous tick, in us.
             skipped: Number of ticks that were skipped before this tick.
         """

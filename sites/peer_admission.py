@@ -29,7 +29,8 @@ class PeerAdmission:
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
-        epoch: Common start time of the session, and the request of this site if it joined late.
+        epoch: Common start time of the session and, if this site joined late, its request to
+            join.
         timing: Clocks of the peers.
         inbox: Samples from the peers.
 
@@ -54,11 +55,11 @@ class PeerAdmission:
         self._rejoined_ns = tick_ns(epoch.first, parts.site.rate_hz)
 
     def watch_members(self, t_ns: int) -> None:
-        """Updates who takes part in the session, and checks if a peer is away for too long.
+        """Updates who takes part in the session, and checks if a peer has been away too long.
 
         A member is present while its liveliness token exists, which is observed by the monitor.
-        The monitor also collects the events with which peers join, and this method applies
-        them.
+        The monitor also collects the events with which peers announce that they join, and this
+        method admits these peers.
 
         Args:
             t_ns: Present time, in ns since the epoch (the common start of the session).

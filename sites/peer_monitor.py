@@ -44,8 +44,8 @@ class PeerMonitor:
         admits: True if the scenario lets sites leave a running session and come back.
 
     Attributes:
-        boots: Mapping from the name of each member of the session to its boot (the number of
-            the process start).
+        boots: Mapping from the name of each member of the session to its boot (the random
+            number that identifies one start of its process).
         recorders: Boots of the recorders that are present.
         stored: Boots of the recorders that have stored all messages from this site.
         ended_by: Sentence of the event with which a member ended the run for everyone. Empty if
@@ -105,7 +105,7 @@ class PeerMonitor:
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Updates the list of members, and publishes an event for each that joins or leaves.
+        """Updates the list of members, and publishes an event when a member joins or leaves.
 
         The control loop calls this method ten times per second, so that crashed processes are
         noticed quickly.

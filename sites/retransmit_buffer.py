@@ -114,7 +114,7 @@ class ChannelBuffer:
             self.oldest += 1
 
     def skip(self, count: int) -> None:
-        """Stores empty messages for numbers that the site never publishes.
+        """Stores empty messages for numbers under which the site publishes no message.
 
         Message numbers follow the ticks, and a skipped tick has no message. Without empty
         messages in their place, all later messages would get wrong numbers.

@@ -35,7 +35,7 @@ from .site_news import SiteNews
 from .site_parts import SiteParts
 
 _NO_BOOT = -1
-"""Placeholder for the boot (the number of a process start) of a peer that is not present."""
+"""Placeholder for the boot (the number that identifies a process start) of an absent peer."""
 
 
 class RunningSite:

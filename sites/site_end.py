@@ -72,7 +72,7 @@ class SiteEnd:
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
-        link_monitors: Timing monitors of the links, which know whether the peers have received
+        link_monitors: Timing monitors of the links, which show whether the peers have received
             the last samples of this site.
         output: Record of the last tick. None if no tick was executed.
         failure: Error that ended the run. None if there was none.

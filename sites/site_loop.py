@@ -106,7 +106,7 @@ class PeerInbox:
             self.drain(from_ns)
 
     def admit(self, index: int, boot: int, first: int) -> None:
-        """Accepts samples from a restarted peer, and no longer from its previous process.
+        """Accepts samples of a restarted peer only from its new process.
 
         A sample is accepted only if it has the boot stored for its peer. The ticks between the
         last sample of the previous process and the first tick of the new process have no
@@ -126,7 +126,7 @@ class PeerInbox:
         self._skipped_until[index] = last_tick_without_sample
 
     def find_last_tick_of(self, index: int, boot: int) -> int | None:
-        """Returns the last tick whose sample has arrived from a peer before its restart.
+        """Returns the last tick whose sample arrived from the previous process of a peer.
 
         Call this method before `admit`, which replaces the stored boot with that of the new
         process.
@@ -289,8 +289,9 @@ class StateBlock:
         send: Function that publishes the encoded records of a block.
         turn: Index of the site in the scenario. Sites on one machine send their blocks in
             different ticks, which spreads the work over time.
-        single: True to send each record in its own tick, as required by an external arm, whose
-            driver reads the torque from the records, and by a site that may be restarted.
+        single: True to send each record in its own tick. This is required for an external arm,
+            whose driver reads the torque from the records, and for a site that may be
+            restarted.
 
     Attributes:
         holds_samples: True if the samples for the peers are collected too, so that peers on the
@@ -335,7 +336,7 @@ class StateBlock:
         Args:
             output: The record.
             arrivals: Samples from the peers received by the tick.
-            late_us: Time by which the tick began late, in us.
+            late_us: How late the tick began, in us.
             busy_us: Computing time of the previous tick, in us.
 
         Returns:
@@ -351,8 +352,9 @@ class StateBlock:
         """Sends the pending samples to the peers, unless they are held until a later tick.
 
         If the samples may be held (`holds_samples`), they are sent together in every wake tick.
-        Wake ticks occur `_WAKES_PER_S` times per second, in different ticks for sites with
-        different `turn`, so that not all sites of a machine wake their peers at the same time.
+        There are `_WAKES_PER_S` wake ticks per second. Sites with different values of `turn`
+        have different wake ticks, so that not all sites of a machine wake their peers at the
+        same time.
 
         Args:
             tick: Number of the current tick.

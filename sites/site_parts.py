@@ -323,8 +323,8 @@ class SiteParts:
         """Returns the changes of settings or mode that the site applies in the next tick.
 
         Some changes were requested by users. Others are caused by an external arm: ticks were
-        skipped, the arm has become silent, or its dead-man switch was released or is held
-        again.
+        skipped, its measurements stopped arriving, or its dead-man switch was released or is
+        held again.
 
         Args:
             tick: Number of the tick.

@@ -65,7 +65,8 @@ def run_site(
         UsageError: An endpoint cannot be used.
         ScenarioError: The user's control law cannot be imported or differs from the law named
             in the scenario, or the scenario lacks the limits of an external arm.
-        RunFailed: The run diverged, the user's law failed, or the arm fell silent.
+        RunFailed: The run diverged, the user's law failed, or the measurements of the external
+            arm stopped arriving.
     """
     scenario.check_outside_arms()
     # A site that rejoins a session needs its keys only until the end of the run, see

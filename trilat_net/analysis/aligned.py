@@ -162,11 +162,11 @@ class AlignedRecords(NamedTuple):
 
     @property
     def known_periods(self) -> Bools:
-        """Marks the tick periods that can be judged because both of their ticks have a record.
+        """Marks the tick periods whose start and end ticks both have a record.
 
-        Energy changes between two ticks. If the record of a tick was lost, the periods before
-        and after it are therefore unknown. K ticks bound K - 1 periods, so the shape is (K -
-        1,).
+        A change of energy between two ticks is computed from the records of both. If a record
+        was lost, the changes in the periods before and after its tick are therefore unknown. K
+        ticks bound K - 1 periods, so the shape is (K - 1,).
         """
         is_known_at_start = self.known[:-1]
         is_known_at_end = self.known[1:]
@@ -197,8 +197,8 @@ class AlignedRecords(NamedTuple):
 
         Args:
             log: The log of the run.
-            common: True to cut all sites off where the shortest one ends, as sums over all
-                sites require.
+            common: True to cut off the records of all sites where the shortest records end, as
+                sums over all sites require.
 
         Returns:
             A mapping from site name to records, in scenario order. Sites without records are
@@ -548,8 +548,8 @@ class DelayedPeer(NamedTuple):
         """Marks the tick periods in which the peer's motion comes from records alone.
 
         Both its present and its delayed motion must be known. The other periods contain
-        interpolated records, so energies that depend on the peer are not judged there. K ticks
-        bound K - 1 periods, so the shape is (K - 1,).
+        interpolated records, so energies that depend on the peer are not evaluated there. K
+        ticks bound K - 1 periods, so the shape is (K - 1,).
         """
         now = self.now.known
         delayed = self.delayed.known

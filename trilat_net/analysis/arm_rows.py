@@ -319,8 +319,8 @@ class PlanarArmRows(NamedTuple):
     def task(self) -> None:
         """Always `None`, because the planar arm follows its peers joint by joint.
 
-        It exists because `ChainArmRows.task` describes arms that follow with the end effector.
-        Callers therefore need not distinguish the two kinds of arms.
+        `ChainArmRows.task` describes how an arm follows with its end effector. Since both
+        classes have the property, callers need not distinguish the two kinds of arms.
         """
         return
 

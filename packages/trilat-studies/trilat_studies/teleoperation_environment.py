@@ -136,7 +136,7 @@ class EpisodeTask(Protocol):
             scene: State after the step.
 
         Returns:
-            The reward as a number, or a `Judgement`, which may also be a plain tuple.
+            The reward as a number, or a `Judgement`, or a plain tuple with the same entries.
         """
 
 
@@ -150,7 +150,7 @@ class ReachTask:
     Args:
         site: Site of the end effector.
         radius_m: Largest distance of the goal from the start, in m.
-        within_m: Largest distance from the goal that counts as reached, in m.
+        within_m: Largest distance from the goal at which the goal counts as reached, in m.
         stay_s: Time for which the end effector must stay at the goal, in s.
 
     Attributes:
@@ -249,9 +249,9 @@ class _ActedHand(HandPlayer):
         self._actions = actions
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - already observed
-        """Applies the policy's action for the current step as the decision of the operator.
+        """Takes the policy's action for the current step as the decision of the operator.
 
-        The simulation calls this method whenever the operator must decide.
+        The simulation calls this method whenever a decision of the simulated operator is due.
 
         Args:
             k: Tick in which the decision is due, from 0.
@@ -764,7 +764,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return observation, judgement.reward, terminated, truncated, info
 
     def judge(self, scene: Scene) -> Judgement:
-        """Asks the task for the reward of a step and whether the episode is finished.
+        """Lets the task compute the reward of a step and decide whether the episode ends.
 
         Args:
             scene: State after the step.
@@ -803,7 +803,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         itself. The state of `run` must be the state after these steps.
 
         Args:
-            actions: Actions of all steps of the episode, checked.
+            actions: Actions of all steps of the episode, which have already been checked.
             clipped_actions: Number of these actions that were clipped.
             ends: True if the episode has ended.
         """
@@ -857,7 +857,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
         Args:
             values: The action as passed by the policy.
-            stacklevel: Number of calls from this method to the code of the user.
+            stacklevel: Stack level of the code of the user, as in `warnings.warn`. Level 1 is
+                this method.
         """
         if self._has_warned:
             return

@@ -43,7 +43,7 @@ Flags = NDArray[np.bool_]
 
 
 class TeleoperationVectorEnv(SyncVectorEnv[Any, Any]):
-    """Several environments in which a policy operates one arm, simulated together for speed.
+    """Several environments, in each of which a policy operates one arm, simulated together.
 
     `make_env(..., num_envs=8)` creates this object. It has the interface of Gymnasium's vector
     environments: `step` takes one action per environment and returns one observation for each.
@@ -714,7 +714,7 @@ class _State:
         self._new: list[list[bool]] = []
 
     def read_links(self, name: str, i: int) -> Array:
-        """Returns a quantity of the links to site `i`, shape (lanes, peers, entries)."""
+        """Returns a quantity for each link to site `i`, shape (lanes, peers, entries)."""
         return np.ascontiguousarray(self._lanes.read_links(name, i).transpose(1, 0, 2))
 
     def _find_view(self) -> dict[str, Array]:
@@ -851,7 +851,7 @@ class _ReachTasks:
         task.last_s = float(self._last_s[lane])
 
     def judge(self, state: _State, is_judged: Flags) -> tuple[Array, Flags]:
-        """Computes the rewards of a step in all episodes, and which tasks are complete.
+        """Computes the rewards of a step in all episodes, and finds the completed tasks.
 
         The results equal those of `ReachTask.judge`.
 

@@ -89,7 +89,7 @@ class SiteEnergy:
 
     @cached_property
     def residual(self) -> Array:
-        """Change of the site's energy V_i that no energy flow explains, shape (K,), in J.
+        """Change of V_i that dissipation, transfer and work do not explain, shape (K,), in J.
 
         The residual is V_i - V_i(0) + dissipation + transfer - work, summed over the `judged`
         periods. The last three terms are the attributes of the same names. The residual still
@@ -108,7 +108,7 @@ class SiteEnergy:
         """Change of the arm's energy that has no known cause, shape (K,), in J.
 
         The value is 0 up to numerical errors if the records obey the model of the arm. A large
-        value means that either the records or the model are wrong. It equals `residual` minus
+        value means that either the records or the model is wrong. It equals `residual` minus
         the work caused by executing the continuous control law only once per tick.
         """
         sampling = _accumulate(self.sampling.total, self.judged)
@@ -173,8 +173,8 @@ class SiteEnergy:
         The error of the trapezoidal rule is estimated from the curvature of the total power.
         The error due to torques that are constant between ticks is estimated from the changes
         of these torques, multiplied by the changes of the filtered error r = qd - v, where qd
-        is the joint velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged
-        periods, the entire energy is considered uncertain.
+        is the joint velocity and v the reference velocity. If fewer than `MIN_PERIODS` periods
+        can be evaluated (see `judged`), the entire energy is considered uncertain.
         """
         outflows = [self.transfer, *self.dissipation.values()]
         inflows = list(self.work.values())
@@ -389,17 +389,19 @@ class EnergyBalance:
         """Total energy V of the arms in the stability proof, shape (T,), in J.
 
         V = sum_i beta_i V_i, where V_i is the energy of site i, and beta_i its weight in
-        `beta`. According to the theorem, V never rises unless an operator supplies energy.
+        `beta`. According to the stability theorem, V never rises unless an operator supplies
+        energy.
         """
         return _sum(self.parts)
 
     @cached_property
     def residual(self) -> Array:
-        """Change of V that no energy flow explains, shape (T,), in J.
+        """Change of V that dissipation and work do not explain, shape (T,), in J.
 
         The residual is V - V(0) + dissipation - work, summed over the tick periods that can be
-        evaluated from the records alone. It includes the work of sampling, and should otherwise
-        be close to 0. A large residual shows that the records contradict each other.
+        evaluated from the records alone. Apart from the two causes that `unexplained`
+        subtracts, it should be close to 0. A larger residual shows that the records contradict
+        each other.
         """
         dissipation = _sum(self.dissipation)
         work = _sum(self.work)
@@ -422,9 +424,9 @@ class EnergyBalance:
     def unsupplied(self) -> Array:
         """The energy V excluding the work of operators and environments, shape (T,), in J.
 
-        The curve starts at V(0) and accumulates only changes in judged periods, minus the work
-        of operators, environments and joint stops. It never rises if the conditions of the
-        stability theorem hold.
+        The curve starts at V(0) and accumulates the changes of V minus the work of operators,
+        environments and joint stops, except in tick periods with missing records (see
+        `judged`). The curve never rises if the conditions of the stability theorem hold.
         """
         rise = self._accumulate_judged(self.V - self.external_work)
         unsupplied: Array = self.V[0] + rise
@@ -456,7 +458,7 @@ class EnergyBalance:
         """Work of each external source, shape (T,), in J, keyed by the name of the source.
 
         The sources are the operators, the environments and the mechanical joint stops. Sources
-        that did no work are left out. The report of the certificate names them.
+        that did no work are left out. The report of the certificate lists the others.
         """
         sources = self._work_from_outside
         return {name: work for name, work in sources.items() if work.any()}
@@ -483,7 +485,7 @@ class EnergyBalance:
         """Finds the largest rise of the energy function V above an earlier minimum.
 
         The work of operators and environments is subtracted first, because V may rise by this
-        amount. The result also names the sources of the remaining energy.
+        amount. The result also names the main causes of the remaining rise.
 
         Args:
             tolerance: Threshold that the rise must exceed, in J.
@@ -526,11 +528,11 @@ class EnergyBalance:
     def find_unsupplied_growth(self, tolerance: float) -> list[UnsuppliedGrowth]:
         """Finds growth of the energy V that no external source supplied.
 
-        Such growth contradicts a stable run. The work of operators and environments is first
-        subtracted from V, the energy function of the stability proof. Two rules are then
-        checked. First, V must not end higher than it started. Second, in the second half of the
-        run, the rise from the minimum to the end must be at most half of the fall from the
-        beginning of this half to the minimum.
+        Such growth is evidence that the run is not stable. The work of operators and
+        environments is first subtracted from V, the energy function of the stability proof. Two
+        rules are then checked. First, V must not end higher than it started. Second, in the
+        second half of the run, the rise from the minimum to the end must be at most half of the
+        fall from the beginning of this half to the minimum.
 
         Args:
             tolerance: Threshold that a rise must exceed to count, in J.
@@ -610,7 +612,7 @@ class EnergyBalance:
         all_judged = bool(judged.all())
 
         def select(kind: str) -> dict[str, Array]:
-            """Accumulates energies of one kind, such as dissipation, over the judged periods.
+            """Accumulates energies of one kind, such as dissipation, over the `judged` periods.
 
             Args:
                 kind: The kind, such as "dissipation" or "work".

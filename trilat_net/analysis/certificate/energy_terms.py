@@ -265,7 +265,7 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """Conversion of errors between the arms to motion and torque of this arm's joints.
+        """Converts errors between the arms to motion and torque of this arm's joints.
 
         The conversion differs between arms that follow joint by joint and arms that follow with
         their end effectors.
@@ -383,9 +383,9 @@ class SiteMotion:
     def rests(self) -> Bools:
         """Marks the records in which the arm is coming to rest, or did so shortly before.
 
-        While the arm comes to rest, for example because a peer is silent, the site adds a
-        braking torque. The recorded torque may therefore differ from the torque of the control
-        law and must not be compared with it. The shape is (K,).
+        While the arm comes to rest, for example because no samples of a peer arrive, the site
+        adds a braking torque. The recorded torque may therefore differ from the torque of the
+        control law and must not be compared with it. The shape is (K,).
         """
         records = self.records
         if records.rests.size:
@@ -428,7 +428,7 @@ class SiteMotion:
 
         The limit is either the largest torque or the largest change of torque per tick. At a
         limit, the arm may have received less torque than the control law demanded, which
-        violates a premise.
+        violates a premise of the stability theorem.
         """
         low, high = self.torque_bounds
         c = self.constants
@@ -559,7 +559,7 @@ class SiteMotion:
         - friction, if the joints have any: the work r'(friction(qd) - friction(qd - r)), with
           the joint velocities qd.
         - open axes: the energy that the site passes to others along axes that not all sites
-          follow. It is missing if all sites follow all axes.
+          follow. This kind is left out if all sites follow all axes.
 
         Returns:
             A mapping from kind to energy.
@@ -691,16 +691,17 @@ class SiteMotion:
         return _trapezoid(self, power_left, power_right)
 
     def compute_link_work(self, j: int) -> "Increment":
-        """Returns the work of the link from peer j: the change of V_i when the age jumps.
+        """Returns the work of the link from peer j: the change of V_i at each new sample.
 
-        The sample in use is replaced at the end of a period. By then, the time of the old
-        sample, sent at s, has advanced to s + h. The new sample was sent at s'. With r and e
-        half-way through the jump, and de the jump of e caused by this link, the work is exactly
+        At the end of a period of length h, a new sample, sent at s', replaces the old sample,
+        sent at s. Within the period, the age of the sample in use is treated as constant, so
+        the state of the peer at s + h is used just before the change. With r and e half-way
+        through the jump, and de the jump of e caused by this link, the work is exactly
 
             (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
 
-        For an age that varies smoothly, this is the integral of the term with dT/dt that the
-        theorem omits.
+        If the delay T varies smoothly, this work is the integral of the term with dT/dt that
+        the theorem omits.
 
         Args:
             j: Index of the peer.

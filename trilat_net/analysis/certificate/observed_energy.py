@@ -139,8 +139,9 @@ class ObservedEnergy(NamedTuple):
     the run is stable.
 
     Attributes:
-        finding: Whether the energies stay above zero, or why this is not judged.
-        premises: The conditions under which the energies count as evidence, each checked.
+        finding: Whether the energies stay above zero, or why this cannot be judged.
+        premises: The conditions under which the energies count as evidence, each with the
+            result of its check.
         least: Minimum of every energy over time.
         largest_j: Largest of all energies, in J.
         residual_j: Largest difference between the energy that a law dissipated and the sum of

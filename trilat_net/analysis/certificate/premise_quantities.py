@@ -27,8 +27,8 @@ from ..torque_sources import WallEnergy
 class FunctionalObstacle(Enum):
     """Reason why the energy function V of the stability proof does not exist for an arm.
 
-    Without V, the certificate judges the run with its other methods, for example from the final
-    motion.
+    Without V, the stability of the run is judged by the other methods of the certificate, for
+    example from the final motion.
     """
 
     UNKNOWN_PARAMETERS = auto()
@@ -42,7 +42,8 @@ class FunctionalObstacle(Enum):
 class MissingFunctional(NamedTuple):
     """Arms for which the energy function V does not exist, all for the same reason.
 
-    The stability proof requires V, which never rises. V exists only for some control laws.
+    The stability proof requires an energy function V that never rises. V exists only for some
+    control laws.
 
     Attributes:
         obstacle: The reason.
@@ -130,8 +131,9 @@ class ParameterQuantities(NamedTuple):
 class GainQuantities(NamedTuple):
     """Evidence on whether the damping gains Kd of all sites are equal up to a factor.
 
-    For example, Kd may be twice as large at one site, because the weights of the sites in V
-    compensate for the factor. Other differences cannot be compensated for in this way.
+    For example, Kd may be twice as large at one site, because the weights of the sites in V,
+    the energy in the stability proof, compensate for the factor. Other differences cannot be
+    compensated for in this way.
 
     Attributes:
         Kd: Gain of each site per joint, in N m s/rad, or in task space per coordinate, in N
@@ -146,10 +148,10 @@ class GainQuantities(NamedTuple):
 
 
 class WallQuantities(NamedTuple):
-    """Evidence on whether simulated walls generate no energy, as the theorem requires.
+    """Evidence on whether simulated walls add no energy to the arms, as the theorem requires.
 
-    A wall whose force is computed once per tick generates energy, which the damping of the arm
-    may remove.
+    A wall whose force is computed once per tick generates energy. The wall adds no energy to
+    the arm if the damping of the arm removes all of it.
 
     Attributes:
         walls: The walls that were touched, each with the energy that it generated and the
@@ -172,9 +174,10 @@ class WallQuantities(NamedTuple):
 
 
 class DominanceQuantities(NamedTuple):
-    """Evidence on whether the dominance factors are constant and determine weights for V.
+    """Evidence on whether the dominance factors are constant and yield weights for all sites.
 
-    The stability theorem requires both. V is its energy function.
+    The stability theorem requires both, because its energy function V is the sum of the
+    energies of the sites, multiplied by these weights.
 
     Attributes:
         changing: Sites whose dominance factors change.
@@ -251,7 +254,7 @@ class FollowingQuantities(NamedTuple):
             which it held its position, braked, moved back to its reference or had stopped.
         limited_ticks: Number of ticks at which the reference velocity was limited, keyed by
             site name.
-        is_halted: True if a site had stopped.
+        is_halted: True if any site had stopped.
     """
 
     interruptions: tuple[Interruption, ...]
@@ -316,11 +319,11 @@ class StopQuantities(NamedTuple):
 
 
 class AxisQuantities(NamedTuple):
-    """Evidence on whether sites follow each other along the same axes.
+    """Evidence on whether sites that follow each other do so along the same axes.
 
     In task space, an end effector may follow along only some axes, for example not in
-    orientation. The condition fails if a site follows along an axis that the site it follows
-    leaves free.
+    orientation. The condition fails if a follower uses an axis along which the followed site
+    itself is free to move.
 
     Attributes:
         faults: Pairs (follower, followed site) with an axis that only the follower follows.
@@ -355,11 +358,13 @@ class Supply(NamedTuple):
         sources: Names of the sources.
         energy_j: Largest energy supplied in excess of the energy absorbed, in J.
         is_passive: True if this energy is only a rounding error.
-        in_task_space: True if a site follows in task space. In that case r is qd - v.
+        in_task_space: True if a site follows in task space. The supplied energy is computed
+            with the filtered error r, which is then defined as qd - v, with the reference
+            velocity v, instead of qd + Lambda e.
         released_s: Time after which no operator or wall pushes, in s.
         free_s: Duration of the motion after this time, in s.
-        least_free_s: Shortest duration of a motion without pushes to which the theorem applies,
-            in s.
+        least_free_s: Shortest duration `free_s` for which the theorem is applied to the motion
+            without pushes, in s.
     """
 
     sources: tuple[str, ...]
@@ -374,7 +379,8 @@ class Supply(NamedTuple):
 class OperatorQuantities(NamedTuple):
     """Evidence on whether operators and environments are passive.
 
-    A passive operator never returns more energy than it received. Otherwise V may rise.
+    A passive operator never returns more energy than it received. If an operator is not
+    passive, the energy V of the stability proof may rise.
 
     Attributes:
         unmeasured: Sites with external arms whose external torque is not recorded.
@@ -429,9 +435,9 @@ class AbsentSpan(NamedTuple):
     def list_of_log(cls, log: Log) -> "list[AbsentSpan]":
         """Finds the time intervals in which sites were absent from the session.
 
-        A site is absent after it has left and until it joins again. If the session reported
-        that the site left or was lost, it is also absent from its last record to the end of the
-        run.
+        A site is absent from the time at which it leaves until it joins again. If the session
+        reported that the site left or was lost, it is also absent from its last record to the
+        end of the run.
 
         Args:
             log: The log of the run.
@@ -525,11 +531,11 @@ class SamplingQuantities(NamedTuple):
 
     Between two ticks, the torque is constant while the arm continues to move. The law sees the
     arm only once per tick, and does not account for the energy that the torque supplies in
-    between.
+    between (the leak).
 
     Attributes:
-        site: Site that received most of this energy.
-        leak_j: This energy, in J.
+        site: Site with the largest leak.
+        leak_j: The largest leak, in J.
     """
 
     site: str
@@ -579,8 +585,8 @@ class Premise(NamedTuple):
     def text(self) -> str:
         """A sentence for the user on what the log shows about the condition.
 
-        For constant delays, for example, the sentence names the links whose delays varied. The
-        package `presentation` generates it from the values in `quantities`.
+        For the premise "delays", for example, the sentence names the links whose delays varied.
+        The package `presentation` generates it from the values in `quantities`.
         """
         return str(find_hook("describe a premise")(self.quantities))
 

@@ -64,7 +64,7 @@ class _Steps:
 
 
 class SweepAxis(NamedTuple):
-    """One swept scenario key with its values, such as "link.delay_ms=0:400:50".
+    """A scenario key that a sweep varies, with its values, such as "link.delay_ms=0:400:50".
 
     Attributes:
         description: The axis as the user wrote it, "KEY=a:b:step" or "KEY=v1,v2,v3".
@@ -91,7 +91,7 @@ class SweepAxis(NamedTuple):
 
     @property
     def numeric(self) -> bool:
-        """True if all values on the axis are numbers, which an axis of a map requires."""
+        """True if all values on the axis are numbers, as required for an axis of a map."""
         if isinstance(self.texts, _Steps):
             return True
         return all(is_number(_parse_value(text)) for text in self.texts)

@@ -50,7 +50,7 @@ class CellClass(StrEnum):
         """True if a run of this class counts as stable, False if not, `None` if unknown.
 
         Only converged runs count as stable. The stability is unknown for undecided runs, and
-        for cells that were rejected because they are not valid scenarios.
+        for cells that were rejected because their scenarios are not valid.
         """
         if self in (CellClass.UNDECIDED, CellClass.REFUSED):
             return None
@@ -76,7 +76,7 @@ class CellClass(StrEnum):
 
 
 RUN_CLASSES = tuple(verdict for verdict in CellClass if verdict is not CellClass.REFUSED)
-"""Classes of a cell that was run. A rejected cell is not a valid scenario and is not run."""
+"""Classes of a cell that was run. A rejected cell has no valid scenario and is not run."""
 TOTAL_KEYS = ("rms_error_rad", "effort_nm", "force_peak_n", "walls_j")
 """Fields of a result that summarise the whole run, see `RunTotals`."""
 
@@ -92,9 +92,9 @@ class CellResult(msgspec.Struct, frozen=True):
     Attributes:
         verdict: Class of the cell.
         motion: Behaviour at the end, as in the stability certificate. It distinguishes growth
-            from divergence, and decay from convergence. If there was no run, because the cell
-            is not a valid scenario or was judged by its linearised loop, this and all measured
-            quantities are `None`.
+            from divergence, and decay from convergence. If there was no run, because the
+            scenario of the cell is not valid or because the cell was judged by its linearised
+            loop, this and all measured quantities are `None`.
         ran_s: Duration of the run, in s, including extensions. Shorter than planned if an arm
             left its limits.
         extended: Number of times that the duration was doubled.
@@ -199,8 +199,7 @@ class CellResult(msgspec.Struct, frozen=True):
         This is the case if one of the following conditions is met:
 
         - An arm left its limits, or the arms came to rest or drift.
-        - The motion grows with a pronounced trend: over the second half of the run, the largest
-          speed doubled, or error and speed both halved.
+        - The motion clearly grows: over the second half of the run, the largest speed doubled.
         - The motion is bounded and steady: over the second half of the run, the logarithms of
           the largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
 
@@ -273,8 +272,8 @@ class _CellInProgress:
     def find_next_end(self) -> float | None:
         """Returns the time to which the run must continue, in s, or `None` if it is finished.
 
-        A run is finished if a longer run would end in the same way, or at the longest duration.
-        Otherwise its duration is doubled.
+        A run is finished if a longer run would end in the same way, or if it has reached the
+        longest allowed duration. Otherwise, its duration is doubled, up to this limit.
         """
         if self._is_finished or self._end_s >= self._longest_s:
             return None
@@ -328,9 +327,10 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     duration is doubled and the same run continues, up to `longest_s`. The class then follows
     from the stability certificate's verdict on the complete run, see `CellClass.of_decision`.
 
-    A run that chatters, because small motions grow in contact with a sampled wall, is not
-    extended. Chatter may end after minutes, once the parameter estimates of the law have
-    drifted, but this does not make the cell stable.
+    A run in which an arm chatters at a wall is not extended. An arm chatters if small motions
+    grow in contact with a wall whose force is computed only once per tick. Chatter may end
+    after minutes, once the parameter estimates of the law have drifted, but this does not make
+    the cell stable.
 
     Args:
         text: Canonical text of the cell's scenario. Its `duration_s` is the initial duration.
@@ -418,7 +418,7 @@ def _chatters(scenario: Scenario, run: FusedRun) -> bool:
 
 
 def _has_pronounced_trend(outcome: CellResult) -> bool:
-    """Returns True if the trend of a growing motion is clear enough to end the run.
+    """Returns True if the trend of a motion is clear enough to end the run.
 
     This is the case if, over the second half of the run, the largest speed doubled or both the
     largest error and the largest speed halved.

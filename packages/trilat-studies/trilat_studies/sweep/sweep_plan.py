@@ -147,7 +147,7 @@ class SweepPlan(NamedTuple):
         return [index * (count - 1) // intervals for index in range(checked)]
 
     def cell(self, number: int) -> SweepCell:
-        """Computes a cell from its number.
+        """Returns the cell with a given number.
 
         Args:
             number: Number of the cell, counted row by row from 0.
@@ -196,8 +196,8 @@ class SweepPlan(NamedTuple):
 
         `from_facts` restores the plan. The keys "judge" (how runs are judged), "metrics" (which
         further metrics are measured) and "refine" (how often the stability edge is refined) are
-        omitted if they have their defaults. Plans from older versions, which lack these keys,
-        are therefore encoded in the same way.
+        omitted if they have their defaults. A plan with these defaults is therefore encoded as
+        by older versions, which did not have the keys.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,
@@ -297,9 +297,9 @@ class SweepPlan(NamedTuple):
     def reproduction_duration_s(self, outcome: sweep_cell.CellResult) -> float:
         """Returns the duration with which a run must be started to reproduce its row, in s.
 
-        A run that diverged ended before its planned duration. It is started with the planned
-        duration and will end early again. Every extension of an undecided run doubles the
-        planned duration.
+        This is the duration of the run, unless the run diverged and therefore ended early. A
+        run that diverged is started with its planned duration, including extensions (each
+        doubles the duration), and will end early again.
 
         Args:
             outcome: Result of the run.

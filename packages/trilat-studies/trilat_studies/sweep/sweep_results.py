@@ -146,8 +146,8 @@ class SweepResults(Result):
             folder: Folder in which the file is written, if necessary.
 
         Returns:
-            The command, and a note that the scenario has changed. The note is empty if it has
-            not.
+            The command, and a note that the scenario has changed. The note is empty if the
+            scenario is unchanged.
         """
         plan = self.plan
         source = plan.written.label
@@ -319,17 +319,18 @@ class _GridPoint(NamedTuple):
     def doubtful(self) -> bool:
         """True if the cell is stable with some seeds and not stable with others.
 
-        The result then depends on chance, and more seeds are needed to estimate the
-        probabilities.
+        The result then depends on chance, and more seeds are needed to estimate how probable a
+        stable run is.
         """
         return 0 < self.stable < self.decided
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the probability that a decided run is stable.
+        """95 % confidence interval of the probability that a run is stable.
 
-        Computed with Wilson's method. Even if 10 of 10 runs are stable, the lower end is below
-        1, because other seeds might give another result.
+        Undecided runs are left out. The interval is computed with Wilson's method. Even if 10
+        of 10 runs are stable, its lower end is below 1, because other seeds might give another
+        result.
         """
         return wilson_interval(self.stable, self.decided)
 

@@ -329,8 +329,8 @@ class FinishedSweep(NamedTuple):
         simulated_s: Total simulated time of these runs, in s.
         wall_s: Real time that these runs took, in s.
         jobs: Number of worker processes.
-        alone: Maps each reason why runs were not computed side by side with others to the
-            number of these runs. Not used in a sweep that computes all runs one at a time.
+        alone: Number of runs that were not computed side by side with others, for each reason.
+            Empty if the sweep computes all runs one at a time.
     """
 
     results: SweepResults
@@ -634,7 +634,7 @@ class _NewRuns:
         self.simulated_s = 0.0
 
     def note(self, run: CellRun) -> None:
-        """Counts a finished run for the totals at the end of the sweep."""
+        """Adds a finished run to the totals that are reported at the end of the sweep."""
         self.runs += 1
         self.simulated_s += run.outcome.ran_s
 

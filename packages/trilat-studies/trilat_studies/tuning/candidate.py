@@ -14,10 +14,10 @@ would agree in the absence of gravity:
 Here beta_i is the influence of arm i. It is determined from the dominance factors alpha_ij, the
 weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
 
-A law may promise a motion other than agreement at q*, see `LawSettings.target_motion`. The
-distance of each arm from the promised motion then replaces the distance between the arms in the
-error, and a run is judged by the end of the promised motion. The distance of the mean from q*
-remains part of the error, so that arms that do not move at all have a large error.
+A law may have a target motion other than agreement at q*, see `LawSettings.target_motion`. The
+distance of each arm from the target motion then replaces the distance between the arms in the
+error, and a run is classified by how far the arms end from this motion. The distance of the
+mean from q* remains part of the error, so that arms that do not move at all have a large error.
 
 Walls, and operators who push without a target, do not determine a final pose. A scenario that
 contains them is also run without them, to find the pose at which the arms would come to rest.
@@ -27,8 +27,8 @@ Invariant:
     - A score depends only on the scenario. The errors of a run that does not reach its end are
       `None`.
     - Neither gains nor control laws influence q*.
-    - Only settled runs, which are stable and end at q* or at the pose that their law promises,
-      may be part of a Pareto front.
+    - Only settled runs, which are stable and end at q* or at the end of the target motion of
+      their law, may be part of a Pareto front.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -279,11 +279,13 @@ class CandidateClass(StrEnum):
         Args:
             ends: Analysis of the end of the run and of the second run. If there is no second
                 run, the first one is passed twice.
-            fall_rad: Predicted distance of the arms' mean pose, at the end of a run twice as
-                long, from q* or, if the law promises another motion, from the mean of that
-                motion, in rad. The largest distance over the joints counts.
-            apart_rad: Largest distance of a joint from the mean of all arms, or from the motion
-                that the law promises, in the last second, in rad.
+            fall_rad: Predicted distance of the arms' mean pose from q* at the end of a run
+                twice as long, in rad, for the joint with the largest distance. If the law has a
+                target motion of its own (`LawSettings.target_motion`), the distance from the
+                mean of that motion.
+            apart_rad: Largest distance of a joint from the mean of all arms in the last second,
+                in rad. If the law has a target motion of its own, the distance from that
+                motion.
 
         Returns:
             The worst class that applies to one of the runs.
@@ -329,8 +331,8 @@ def check_final_posture(log: Log) -> list[str]:
     - The run is shorter than planned.
     - An arm hangs down (both of its links point down) and did not hang at the start. Its errors
       and torques are small, but not because of the control law.
-    - The mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
-      explain the distance.
+    - The mean pose of the arms is more than 0.2 rad from the consensus pose q*, although no
+      operator or wall can explain the distance.
 
     Args:
         log: Log of the run.
@@ -418,8 +420,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
         error_rad: RMS distance of the arms from the pose q*, in rad. `None` if the run
             diverged.
         spread_rad: Part of the error that is the distance between the arms at the same time,
-            with no delay. For a law that promises another motion, it is the distance of the
-            arms from this motion.
+            with no delay. For a law with a target motion of its own
+            (`LawSettings.target_motion`), it is the distance of the arms from this motion.
         pose_rad: Part of the error that is the distance of the arms' mean from q*.
         effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
         settled_s: Time from which the largest |e| stays below 0.01 rad, in s, where e is the
@@ -450,8 +452,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
     def average(cls, scores: "Sequence[CandidateScore]") -> "CandidateScore":
         """Combines the scores of a candidate over runs that differ only in their seeds.
 
-        The class is the worst of all runs, and every other field is the mean over the runs, or
-        `None` if it is missing for one of them.
+        The class is the worst class of all runs, and every other field is the mean over the
+        runs, or `None` if it is missing for one of them.
 
         Args:
             scores: Score of each run, at least one.
@@ -549,8 +551,8 @@ class _RunMeasures(NamedTuple):
         end: Analysis of the end of the run.
         fall_rad: Predicted distance from q*, see `CandidateClass.classify`.
         apart_rad: Distance between the arms at the end, see `CandidateClass.classify`.
-        spread_rad: RMS distance of the arms from their mean, or from the motion that their law
-            promises, in rad.
+        spread_rad: RMS distance of the arms from their mean, or from the target motion of their
+            law, in rad.
         pose_rad: RMS distance of the arms' mean from q*, in rad.
         effort_nm: See `CandidateScore`.
         settled_s: See `CandidateScore`.
@@ -579,8 +581,8 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
 def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
     """Measures effort, torque saturation and distances of the arms in a finished run.
 
-    The arms are compared with the consensus pose q*, or with the motion that their law
-    promises, at times that all sites have in common.
+    The arms are compared with the consensus pose q*, or with the target motion of their law, at
+    times that all sites have in common.
 
     Args:
         scenario: Scenario of the candidate, with its gains.
@@ -619,7 +621,7 @@ def _measure_records(scenario: Scenario, whole_run: WholeRun) -> _RunMeasures:
 def _compute_promised_motion(
     scenario: Scenario, t_s: Array, q: Array, tau_x: Array
 ) -> Array | None:
-    """Computes the motion that the law of the first site promises for all arms.
+    """Computes the target motion of all arms under the law of the first site.
 
     Args:
         scenario: Scenario of the run.
@@ -629,8 +631,8 @@ def _compute_promised_motion(
             external torques.
 
     Returns:
-        The promised joint angles, shape (N, K, n), in rad, or `None` if the law promises that
-        the arms move together.
+        The joint angles of the target motion, shape (N, K, n), in rad, or `None` if the target
+        of the law is that the arms move together.
     """
     laws = [scenario.sites[name].control for name in scenario.names]
     if not isinstance(laws[0], LawSettings):
@@ -644,15 +646,15 @@ def _compute_promised_motion(
 
 
 def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
-    """Predicts the distance from the promised pose at the end of a run twice as long, in rad.
+    """Predicts the distance from the target pose at the end of a run twice as long, in rad.
 
     The distance is averaged over the second before the middle of the run and over the last
     second. If it grew between the two, it is assumed to continue growing at the same rate.
 
     Args:
         t_s: Times, shape (K,), in s.
-        from_pose_rad: Distance of the mean pose from q* or from the mean of the promised
-            motion, shape (K, n), in rad.
+        from_pose_rad: Distance of the mean pose from q* or from the mean of the target motion,
+            shape (K, n), in rad.
 
     Returns:
         The distance of the joint that is furthest away.

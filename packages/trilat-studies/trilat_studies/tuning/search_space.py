@@ -82,7 +82,7 @@ class ModelInformation(NamedTuple):
         return [_round_parameter(value) for value in theta]
 
     def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
-        """Returns the limits to which an adaptive law confines its parameter estimates.
+        """Returns the limits within which an adaptive law keeps its parameter estimates.
 
         The P parameters of an arm describe its inertia and its gravity torque. Inertia
         estimates are practically unlimited, because nothing is known about the inertia.
@@ -170,7 +170,7 @@ class SearchSpace(NamedTuple):
     Attributes:
         law: Name of the law. "known" means the law `adaptive` with adaptation switched off and
             the true inertia of the arm.
-        knobs: Gains to search, with their units and ranges.
+        knobs: The gains to be tuned, with their units and ranges.
         known_facts: Information about the arm that the law gets, as text for tables.
         kind: Class of a built-in law. `None` for a user's law.
     """
@@ -359,10 +359,10 @@ def weigh_joints(scenario: Scenario) -> list[float]:
     relative to the largest such inertia of all joints, where M is the inertia matrix. For each
     joint, the smallest of its inertias in the start poses of the sites is used.
 
-    All factors are reduced if the largest damping in the search ranges would be unstable at the
-    arms' tick rate. `validate` rejects damping gains D for which the largest eigenvalue of h
-    M^-1 D, with the tick period h, reaches 1 under the integration scheme `second_order`, or 2
-    under `digital`.
+    All factors are reduced if the largest damping in the search ranges would make the arms
+    unstable at their tick rate. `validate` rejects damping gains D for which the largest
+    eigenvalue of h M^-1 D, with the tick period h, reaches 1 under the integration scheme
+    `second_order`, or 2 under `digital`.
 
     Args:
         scenario: Scenario in which the laws are compared.

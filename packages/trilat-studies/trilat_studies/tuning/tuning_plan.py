@@ -11,8 +11,8 @@ refines the law's own front, in four rounds with decreasing step sizes.
 Invariant:
     - The result depends only on the plan, not on the number of processes or on their speed.
     - The candidates depend only on the seed, the search space and the scores of earlier rounds.
-    - Only stable runs that end at the common pose of the arms compete. Of two runs with equal
-      objectives, the first is kept.
+    - Only stable runs that end at the common pose of the arms can be on a front. Of two runs
+      with equal objectives, the first is kept.
     - The gains printed in the paper are measured, but do not take part in the search and belong
       to no front.
 """
@@ -101,7 +101,7 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
     A point is on the front if no other point is at least as good in both objectives.
 
     Args:
-        points: The points. `None` represents a run that does not compete.
+        points: The points. `None` represents a run that is excluded from the front.
     """
     competitors = []
     for index, point in enumerate(points):
@@ -119,7 +119,7 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Computes how isolated each point of a front is, to find gaps that should be refined.
+    """Computes how isolated each point of a front is, to find gaps that should be filled.
 
     The crowding distance of a point is half the perimeter of the box between its two
     neighbours, with each side relative to the span of the front. It is infinite for the first
@@ -203,8 +203,8 @@ class CandidateSearch:
         """Objective and effort of each candidate that was tried, in order of execution.
 
         The objective is the error, in rad, or the settling time, in s. The effort is the RMS
-        motor torque excluding gravity, in N m. `None` stands for a candidate that does not
-        compete, because the arms were not stable or did not end at the common pose.
+        motor torque excluding gravity, in N m. `None` stands for a candidate that is excluded
+        from the front, because the arms were not stable or did not end at the common pose.
         """
         return [self._objective.point(score) for score in self.scores]
 
@@ -593,8 +593,8 @@ class TuningResult(Result):
             scores.
         printed: Scores of the published gains of the adaptive law (those in the paper that
             introduced it), for comparison.
-        alone: Maps each reason why runs were not computed side by side with others to the
-            number of these runs. Not used in a search that computes all runs one at a time.
+        alone: Number of runs that were not computed side by side with others, for each reason.
+            Empty if the search computes all runs one at a time.
     """
 
     plan: TuningPlan

@@ -63,8 +63,8 @@ class TuningReport:
 
         The report begins with a table of the laws, explanations of the behaviour classes, and
         each law's Pareto front, which contains its best trade-offs between error and effort.
-        The scores of the published gains, notes, and the commands that repeat the best runs
-        follow.
+        It ends with the scores of the published gains, notes, and the commands that repeat the
+        best runs.
         """
         yield self._tabulate_laws()
         yield from (f"  {line}" for line in _list_class_meanings())
@@ -128,7 +128,7 @@ class TuningReport:
         return [json_path, page_path, *picture_paths]
 
     def list_energy_notes(self) -> list[str]:
-        """Returns notes on laws with a declared energy, which the tuning does not check.
+        """Returns notes on laws that declare energies, because the tuning does not check these.
 
         The tuning classifies runs by the motion of the arms only. A run in which a law's
         declared energy became negative can therefore count as stable here, although the verdict
