@@ -153,9 +153,9 @@ def find_burst_interval_s(scenario: Scenario) -> float | None:
     """Finds the mean time between two bursts of lost samples, in s.
 
     Bursts follow the Gilbert-Elliott model: a sample that arrives may be followed by a burst,
-    in which a fraction `loss_bad` of the samples is lost. If a sample leaves a burst with
-    probability r, the mean burst has 1 / r samples, and bursts contain the fraction `loss` /
-    `loss_bad` of all samples.
+    in which a fraction `loss_bad` of the samples is lost. If each sample of a burst is its last
+    one with probability r, a burst has 1 / r samples on average. Bursts contain the fraction
+    `loss` / `loss_bad` of all samples.
 
     Args:
         scenario: The scenario.

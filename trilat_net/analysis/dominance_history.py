@@ -33,15 +33,15 @@ rounded.
 
 
 class DominanceHistory(NamedTuple):
-    """The dominance factors over time with which an arm follows each of its P peers.
+    """The dominance factors with which an arm follows each of its P peers, over time.
 
     A factor lies between 0 and 1. The peers are in scenario order.
 
     Attributes:
         alpha: Factors at every row, shape (K, P).
         rate: Their time derivatives as used by the controller, shape (K, P), in 1/s.
-        before: Factors at the end of every tick period, just before any sudden change there,
-            shape (K - 1, P).
+        before: Factors at the end of every tick period, just before any sudden change at that
+            time, shape (K - 1, P).
     """
 
     alpha: Array
@@ -80,7 +80,7 @@ class DominanceHistory(NamedTuple):
             t_s: Times of the ticks, shape (K,), in s.
 
         Raises:
-            LogError: A record names an invalid change.
+            LogError: A recorded change is invalid.
         """
         history = DominancePlan.of_log(log, site).evaluate(t_s)
         is_present = ~_find_lost_peers(log, site, t_s)
@@ -342,8 +342,9 @@ class _LyapunovWeights(NamedTuple):
 def find_kd_scales(Kd: Array) -> Array | None:
     """Finds the ratio of each arm's damping gain Kd to the gain of the first arm.
 
-    The stability proof allows arms with different gains if the ratio is the same for all
-    joints, because the weights of the arms in V then compensate for it.
+    The stability proof allows arms with different gains if the ratio is the same for all joints
+    of an arm. The weights of the arms in the energy function V of the proof then compensate for
+    the different gains.
 
     Args:
         Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an

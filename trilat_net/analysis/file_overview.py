@@ -377,9 +377,9 @@ def _describe_session(log: Log) -> JsonObject:
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Describes how complete the records of a site are and how punctual its loop was.
+    """Describes how complete a site's records are, and how punctually its ticks began.
 
-    The timing is `None` in a simulation, which reads no clock.
+    The timing is `None` for a simulated run, in which no clock is read.
 
     Args:
         log: The log of the run.

@@ -70,11 +70,11 @@ def find_task_reference(
 
 
 class JointFollowing(NamedTuple):
-    """Converts errors to motion and torque for a site that follows joint by joint.
+    """Computes reference motion and torque of a site that follows others joint by joint.
 
-    Its coordinates are the joint angles, so its methods do no more than multiply by a gain.
-    `TaskFollowing` has the same methods for sites that follow with the end effector. In all
-    methods, `rows` selects the K rows of the records to evaluate.
+    The followed coordinates are the joint angles, so no Jacobian is needed. `TaskFollowing` has
+    the same methods for sites that follow with the end effector. In all methods, `rows` selects
+    the K rows of the records to evaluate.
 
     Attributes:
         Lambda: Gain of the synchronisation error e, shape (n,), in 1/s.
@@ -139,10 +139,10 @@ class JointFollowing(NamedTuple):
         rows: Rows,  # noqa: ARG002
         e: Array,
     ) -> tuple[Array, Array]:
-        """Returns two arrays of zeros, because following joint by joint needs no damping.
+        """Returns two arrays of zeros, because following joint by joint inverts no Jacobian.
 
-        Only arms that follow with their end effectors are damped near singular poses (see
-        `TaskFollowing`).
+        Arms that follow with their end effectors use an inverse of the Jacobian, which is
+        damped near singular poses (see `TaskFollowing`).
 
         Args:
             rows: Rows of the records. Ignored.
@@ -157,7 +157,7 @@ class JointFollowing(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskFollowing:
-    """Converts errors to motion and torque for a site that follows with its end effector.
+    """Computes reference motion and torque of a site that follows with its end effector.
 
     The arm has n joints, and its end effector follows along some of the m task coordinates.
     Joints that the task leaves free move towards a preferred posture. Near singular poses,
@@ -194,7 +194,7 @@ class TaskFollowing:
         return y
 
     def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
-        """Returns the joint velocity with which the end effector should reduce its error.
+        """Returns the joint velocity that should reduce the errors, and its derivative.
 
         Args:
             rows: Rows of the records whose pose is used.
@@ -275,12 +275,13 @@ class TaskFollowing:
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns how far the damping near singular poses violates two equations of the proof.
+        """Returns the errors that damping of the inverse causes in two equations of the proof.
 
-        Without damping, the equations J r = xd + Lambda e and a = dv/dt hold exactly. J is the
-        Jacobian, r the filtered error, xd the velocity of the end effector, e its error, Lambda
-        a gain, v the reference velocity of the joints, and a the acceleration that the control
-        law uses for dv/dt. Away from singular poses, both results are zero.
+        The inverse of the Jacobian J is damped near singular poses. Without damping, the
+        equations J r = xd + Lambda e and a = dv/dt hold exactly. Here r is the filtered error,
+        xd the velocity of the end effector, e its error, Lambda a gain, v the reference
+        velocity of the joints, and a the acceleration that the control law uses for dv/dt. Away
+        from singular poses, both results are zero.
 
         Args:
             rows: Rows of the records whose pose is used.

@@ -33,16 +33,17 @@ from .twins.twin_growth import TwinGrowth
 
 
 def list_law_proofs(scenario: Scenario) -> list[str]:
-    """Lists the stability conditions of control laws that prove that all motions decay.
+    """Lists the control laws' stability conditions, if they prove that all motions decay.
 
-    The conditions are evaluated for the delays and dominance factors at the end of the
-    scenario.
+    The conditions are evaluated for the delays at the end of the scenario.
 
     Args:
         scenario: The scenario.
 
     Returns:
-        One phrase per condition. Empty unless the condition of every site holds and is a proof.
+        One phrase per distinct condition. Empty if a change of the dominance factors is
+        planned, or if the law of some site has no condition that proves the decay of all
+        motions.
     """
     if any(change.dominance for change in scenario.timeline):
         return []
@@ -116,9 +117,9 @@ class VirtualRun:
     longer than the run. Each piece of evidence is computed when it is first needed.
 
     Args:
-        scenario: Scenario of the run. Its duration may be shorter than that of the run.
-        run: The run in the fused loop. It must not be continued afterwards, because later
-            evidence would then be about another run.
+        scenario: Scenario of the run, whose duration may differ from that of the run.
+        run: The run in the fused loop. The caller must not continue this run, because evidence
+            that is computed later would then refer to a longer run.
         end: How the motion ends. If `None`, this is determined from the run.
     """
 
@@ -147,7 +148,8 @@ class VirtualRun:
     def twins(self) -> TwinGrowth | None:
         """How the effects of small pushes in repeated runs develop.
 
-        The pushes are those of `Push.choose`. `None` if the roots decide without them.
+        The pushes are those of `Push.choose`. `None` if the roots and the motion at the end of
+        the run are sufficient for the decision.
         """
         if self._findings.is_decided_by_roots:
             return None
@@ -165,11 +167,12 @@ class VirtualRun:
     def decision(self) -> StabilityDecision:
         """The decision on whether the run is stable.
 
-        The run is simulated again to record every tick only if the verdict would otherwise be
-        settled or open, if its laws have an energy function V or declare energies, and if it
-        has at most `MAX_RECORDED_TICKS` ticks. The energies, which require the records, may
-        prove that the run is stable, or contradict the verdict that it settled. Up to that
-        number of ticks, the decision is the same as in a certificate of the run.
+        The energies of a run may provide a proof of stability, or evidence against the verdict
+        "settled". To compute the energies, the run is simulated again with a record of every
+        tick. This is done only if the verdict would otherwise be "settled" or "open", if the
+        control laws have an energy function V or declare energies, and if the run has at most
+        `MAX_RECORDED_TICKS` ticks. Up to this number of ticks, the decision is the same as in a
+        certificate of the run.
         """
         scenario = self._scenario
         decision = self._findings._replace(twins=self.twins).decide()

@@ -1,11 +1,10 @@
-"""Judges from the motion at the end of a run whether it is stable, not stable, or open.
+"""Judges from the motion at the end of a run whether it is settled, not stable, or open.
 
 The verdict is based on the error e of each site (the difference between its motion and its
 reference) and on the joint velocities qd, not on any theory. The largest |e| and |qd| of each
 joint in intervals of 50 ms are called envelopes. Their trends over the second half of the run,
-which `envelope_trend` determines, decide whether the joint converges, decays, oscillates,
-drifts or grows. If the record does not show which, the joint is undecided, and the verdict is
-open.
+which `envelope_trend` determines, show whether the joint converges, decays, oscillates, drifts
+or grows. If the record does not show which, the joint is undecided, and the verdict is open.
 
 If an operator acts or the control loop changes within the second half, only the time after the
 last action or change is judged, provided that it is long enough.
@@ -16,7 +15,7 @@ joint is undecided.
 
 Invariant:
     - All commands use the verdict of this module (docs/reference/stability.md).
-    - Each joint of each site is judged separately, and the worst joint decides.
+    - Each joint of each site is judged separately, and the worst joint determines the verdict.
     - A verdict describes the record and predicts nothing.
     - Further knowledge, such as the energy function V of the stability proof or the
       characteristic roots, may turn a stable run into an open run, but never the reverse.
@@ -105,8 +104,8 @@ class Stability(StrEnum):
 class EndBehaviour(StrEnum):
     """How the arms move at the end of a run, from the best to the worst behaviour.
 
-    The order matters, because the worst joint decides the verdict on the run. `stability` maps
-    the behaviour to a verdict. The value of each member is a phrase for the user.
+    The order matters, because the worst joint determines the verdict on the run. `stability`
+    maps the behaviour to a verdict. The value of each member is a phrase for the user.
     """
 
     CONVERGED = "converged"
@@ -139,14 +138,14 @@ _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class EndDoubt(NamedTuple):
-    """Finding that keeps the motion at the end of a run from showing that the run is stable.
+    """Finding that leaves open whether a run is stable.
 
     Attributes:
         name: Name of the finding. "sites apart": coupled sites do not agree, although nothing
             holds them apart. "arms fell": arms hang down at the end, but did not at the start.
             "arm thrown": an arm ends far away from every start pose, although no operator
-            pushed. "loop changes": the control loop changes within the judged part. "operator
-            acts": an operator changes its action within the judged part.
+            pushed it. "loop changes": the control loop changes within the judged part.
+            "operator acts": an operator changes its action within the judged part.
         sites: Names of the affected sites. For "sites apart", the sites with the smallest and
             the largest angle.
         distance_rad: Distance between the sites that are apart, or distance of the thrown arm
@@ -163,9 +162,9 @@ class EndDoubt(NamedTuple):
 class RunEnd(NamedTuple):
     """How the motion of a run ends, such as at rest or growing, with the data that show it.
 
-    The trends of the tracking error e and of the joint velocity qd over the last part of the
-    run decide. The object describes all arms of the run, or a single joint while the joints are
-    compared.
+    The behaviour is determined by the trends of the tracking error e and of the joint velocity
+    qd over the last part of the run. The object describes all arms of the run, or a single
+    joint while the joints are compared.
 
     Attributes:
         behaviour: Behaviour of the worst joint, such as settled or growing.
@@ -214,11 +213,11 @@ class RunEnd(NamedTuple):
 
     @property
     def stability(self) -> Stability:
-        """The verdict on the run from its end: stable, not stable, or open.
+        """The verdict on the run from its end: settled, not stable, or open.
 
-        A run that looks stable is open if there are `doubts`. A run that does not look stable
-        is open if an operator acts, because the operator may have caused the motion. If the
-        motion exceeded the limits of an arm, the run is not stable in any case.
+        A run that appears to have settled is open if there are `doubts`. A run that appears
+        unstable is open if an operator acts, because the operator may have caused the motion.
+        If the motion exceeded the limits of an arm, the run is not stable in any case.
         """
         stability = self.behaviour.stability
         if stability is not Stability.NOT_STABLE:
@@ -387,7 +386,7 @@ class RunTrace(NamedTuple):
         buckets: For each site, an array with one row per interval, shape (K, 3 n). A row
             contains the largest |e|, the largest |qd|, and the last angle q of every joint, or
             -1 in an interval without a record. There may be columns for more joints than the
-            site has. The last interval may be incomplete, and no trend uses it.
+            site has. The last interval may be incomplete, and is not used for trends.
         tau_x: For each site, the torque of operator and environment at the last record, shape
             (n,), in N m.
         diverged_at_s: When the first site exceeded its limits, in s, or `None` if no site did.
@@ -457,9 +456,9 @@ class RunTrace(NamedTuple):
     def classify_end(self, scenario: Scenario) -> RunEnd:
         """Judges from reduced data whether the motion decayed at the end of a run.
 
-        The worst joint of all sites decides. A run whose joints have stable trends is left open
-        if its sites do not agree, if arms fell, or if the control loop changed until shortly
-        before the end.
+        The worst joint of all sites determines the result. Even if the motion of all joints
+        decays, the run is left open if its sites do not agree, if arms fell, or if the control
+        loop changed until shortly before the end.
 
         Args:
             scenario: The scenario.

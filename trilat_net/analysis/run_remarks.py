@@ -6,7 +6,7 @@ limits. The circumstances are:
 
 - a motor was at its torque limit and did not apply the full torque of the control law;
 - an operator or a wall pushed with a large fraction of the torque limit;
-- ticks began late by a full period or more;
+- ticks began at least one full period late;
 - samples in use were clearly younger or older than the delay that the scenario states for their
   link;
 - a user's program moved an arm, or failed while moving an arm.
@@ -74,16 +74,17 @@ class _OddAge(NamedTuple):
 class RunCircumstances(NamedTuple):
     """Circumstances of a run that may explain why it was judged stable or not.
 
-    `RunCircumstances.of_log` finds them. An object created without arguments means that none
-    occurred.
+    `RunCircumstances.of_log` finds these circumstances. An object that is created without
+    arguments describes a run without any of them.
 
     Attributes:
         at_limit_s: How long the motors of each site were at their torque limit, in s, keyed by
             site.
-        large_pushes: The largest push at each site where it was a large fraction of the limit.
-        late_ticks: Number of ticks that began late by a period or more, keyed by site.
-        odd_age: Age of the samples in use on the link where it deviates most from the stated
-            delay, or `None` if the ages agree with the delays on every link.
+        large_pushes: Largest torque of operators and walls at each site where it was a large
+            fraction of the torque limit.
+        late_ticks: Number of ticks that began at least one tick period late, keyed by site.
+        odd_age: Mean age of the samples in use on the link on which this age deviates most from
+            the stated delay, or `None` if the ages agree with the delays on every link.
         program_sites: Sites whose arms were moved by a user's program. The verdict ignores how
             the program reacts to the arms.
         failures: Sentences from the log about programs that failed.

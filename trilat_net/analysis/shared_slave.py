@@ -23,12 +23,13 @@ class UserShares(NamedTuple):
 
     The slave follows the master of each user with a dominance factor. For example, with shares
     of 0.7 and 0.3 the first user leads. In some experiments a program moves the arm of one
-    user. Any other user who leads counts as a person who intervenes.
+    user. If another user leads, this counts as an intervention by a person.
 
     Attributes:
         shares: The slave's dominance factors for its U users, shape (K, U).
-        leader: Index of the user with the largest factor, shape (K,). If no single factor is
-            largest, this is the index of the program's user.
+        leader: Index of the user with the largest factor, shape (K,). If the program's user
+            shares the largest factor with another user, this is the index of the program's
+            user.
         program: Index of the user whose arm the program moves.
     """
 
@@ -59,8 +60,9 @@ class SharedSlave:
     def program(self) -> str:
         """The user whose arm was moved by a program. Empty if no program moved an arm.
 
-        This is the last user with a hand of kind "own", or otherwise the last user whose arm
-        was moved by a policy, through the LeRobot plugin or in an environment.
+        This is the last user who has a hand of kind "own" in the scenario, or otherwise the
+        last user whose arm was moved by a policy, through the LeRobot plugin or in an
+        environment.
         """
         log = self._log
         held_by_policy = [user for user in self.users if _is_held_by_policy(log, user)]
@@ -107,8 +109,9 @@ class SharedSlave:
 def list_program_sites(log: Log) -> list[str]:
     """Lists the sites whose arms were moved by a program in a run, in scenario order.
 
-    The program is a hand of kind "own", or a policy that moved the arm through the LeRobot
-    plugin or in an environment. Unlike a script, the program reacts to the motion of the arms.
+    The program is a hand of kind "own" in the scenario, or a policy that moved the arm through
+    the LeRobot plugin or in an environment. Unlike a script, the program reacts to the motion
+    of the arms.
 
     Args:
         log: Log of the run.

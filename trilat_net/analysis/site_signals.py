@@ -226,7 +226,7 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
-    """Returns how far operators displaced a site, compared with a run without operators.
+    """Returns how far operators displaced an arm, compared with a run without operators.
 
     Arms also move without operators, for example while they synchronise. The difference between
     the two runs is the motion caused by the operators.

@@ -54,7 +54,7 @@ the run is not stable, in rad.
 A run that is further away may come to rest in another pose, whose roots may be stable.
 """
 LEAST_BURSTS = 100.0
-"""Number of bursts of lost samples above which their mean effect decides how a run ends."""
+"""Number of bursts of lost samples above which their mean effect determines how a run ends."""
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 _LONGEST_ADVISED_S = 1e4
 """Length of the longest run that is advised, in s. The estimate of a longer one rests on a root
@@ -194,10 +194,10 @@ class LoopRoots(NamedTuple):
 
     @property
     def proven(self) -> str:
-        """The verdict on small motions about the final pose that is proven by the roots.
+        """The verdict on small motions about the final pose, if exact roots prove it.
 
         The verdict is "stable" if the motions decay and "unstable" if they grow. Empty if the
-        roots are not exact (see `exact`), because only exact roots prove a verdict.
+        roots are not exact (see `exact`).
         """
         return self.verdict if self.exact else ""
 
@@ -214,18 +214,18 @@ class LoopRoots(NamedTuple):
     def measure_decay_misfit(self, end: RunEnd) -> float:
         """Measures how poorly a slow decay explains a motion that seems to last.
 
-        The roots predict the rate of the decay. An oscillation is compared with the roots that
-        oscillate, because another slow root does not explain it. A drift is compared with the
-        slowest root. The decay explains the motion in two cases: if it halves the motion at
-        most once in the judged part, too little for a trend to show, or if |e| and |qd| change
-        at the rate of the root.
+        The roots predict the rate of the decay. An oscillation is compared with the slowest
+        root that oscillates, because a root without oscillation does not explain it. A drift is
+        compared with the slowest root of all. The decay explains the motion in two cases: if it
+        halves the motion at most once in the judged part, which is too little to show a trend,
+        or if |e| and |qd| change at the rate of the root.
 
         Args:
             end: How the motion ends.
 
         Returns:
-            A dimensionless misfit: at most 1 if the motion at the end may be the decay. It is
-                infinity if the roots are not stable or were not computed with numerical
+            A dimensionless misfit: at most 1 if the motion at the end may be a slow decay. It
+                is infinity if the roots are not stable or were not computed with numerical
                 derivatives, or if the motion grows or does not seem to last.
         """
         is_swing = end.behaviour is EndBehaviour.BOUNDED
@@ -275,8 +275,8 @@ class RunFindings(NamedTuple):
             repeated.
         roots: Roots of the loop at the end of the run, or `None` if they were not computed.
         is_covered: True if the stability theorem proves the loop stable.
-        law_proofs: Phrases that name the stability conditions of control laws that prove the
-            loop stable.
+        law_proofs: Phrases that name stability conditions of control laws, if these conditions
+            prove that the loop is stable.
         doubts: Findings that contradict a stable run, such as an energy function that rises, or
             missing records.
         rises: True if the energy function V of the stability proof rose without supplied
@@ -326,9 +326,10 @@ class RunFindings(NamedTuple):
 
     @property
     def is_decided_by_roots(self) -> bool:
-        """True if twins cannot change the decision and therefore need not be simulated.
+        """True if repeated runs with small pushes (twins) cannot change the decision.
 
-        This is the case if the run diverged, or if its exact roots and its end agree.
+        Twins then need not be simulated. This is the case if an arm exceeded its limits, or if
+        the exact roots and the end of the run are sufficient for the decision.
         """
         return _decide_by_roots(self, self._list_obstacles()) is not None
 
@@ -360,7 +361,11 @@ class RunFindings(NamedTuple):
 
     @property
     def has_proof(self) -> bool:
-        """True if the theorem, a control law or exact roots prove the loop stable."""
+        """True if the loop is proven stable.
+
+        The proof is the stability theorem, the stability conditions of the control laws, or the
+        exact characteristic roots of the loop.
+        """
         return self.is_covered or bool(self.law_proofs) or self.proven_by_roots == "stable"
 
     @property
@@ -373,7 +378,7 @@ class StabilityDecision(NamedTuple):
     """The decision on whether a run of coupled arms is stable, with the evidence for it.
 
     Attributes:
-        stability: The decision.
+        stability: The verdict on the run.
         findings: The evidence.
         basis: Name of the evidence on which the decision is based.
         obstacles: Names of the reasons that prevent a better verdict. Empty if the run is
@@ -412,7 +417,7 @@ class StabilityDecision(NamedTuple):
 
     @property
     def is_too_short(self) -> bool:
-        """True if only the length of the recording prevents a better verdict."""
+        """True if a better verdict is prevented only because the recording is too short."""
         return "short record" in self.obstacles
 
 

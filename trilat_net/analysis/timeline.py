@@ -56,9 +56,9 @@ class _AppliedChange(NamedTuple):
     def text(self) -> str:
         """A phrase for the user that describes the state after the change.
 
-        For an order to a site, the phrase is the order and its length, for example "hold, 500
-        ticks". For a link, it describes the new delay. For shares, it lists the new shares with
-        the transition time, for example "m1 0.7, m2 0.3 within 2 s".
+        For an order to a site, the phrase consists of the order and its duration, for example
+        "hold, 500 ticks". For a link, it describes the new delay. For shares, it lists the new
+        shares with the transition time, for example "m1 0.7, m2 0.3 within 2 s".
         """
         change = self.change
         if change.order:
@@ -188,7 +188,7 @@ class Timeline:
         the site skipped so many that it held its position.
 
         Raises:
-            LogError: A record names an invalid change.
+            LogError: A recorded change is invalid.
         """
         log = self._log
         applied_changes = [
@@ -226,11 +226,11 @@ class Timeline:
     def effective_commands(self) -> list[Change]:
         """The commands that changed something, ordered by the time at which they take effect.
 
-        A command that sets a link, or the dominance factors of a site, to their present values
-        is left out. Orders to sites, such as "stop", are always included.
+        A command that leaves a link, or the dominance factors of a site, unchanged is left out.
+        Orders to sites, such as "stop", are always included.
 
         Raises:
-            LogError: A record names an invalid change.
+            LogError: A recorded change is invalid.
         """
         scenario = self._log.scenario
         commands = []
@@ -261,7 +261,7 @@ class Timeline:
 
     @property
     def final_scenario(self) -> Scenario:
-        """The scenario of the log, with the users' commands of the run as planned changes.
+        """The scenario of the log, in which the commands that users gave are planned changes.
 
         Its duration is the recorded duration. The settings in effect at its end are therefore
         those of the final control loop.
@@ -278,7 +278,7 @@ class Timeline:
         """The delay models of every network link of the scenario, keyed by the name "j->i".
 
         Raises:
-            LogError: A record names an invalid change.
+            LogError: A recorded change is invalid.
         """
         stated_links = {}
         for name, link in self._log.scenario.links.items():
@@ -325,7 +325,7 @@ class Timeline:
         If a person ordered an arm to stop, the reason for the alarm names this person.
 
         Raises:
-            LogError: A record names an invalid change.
+            LogError: A recorded change is invalid.
         """
         log = self._log
         requesters = {

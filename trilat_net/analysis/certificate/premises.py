@@ -95,18 +95,19 @@ Slower speeds are the rounding error of an axis along which the end effector can
 
 
 class FunctionalFacts(NamedTuple):
-    """Quantities of a run that depend on V and are used to check the theorem's conditions.
+    """Quantities for checking the theorem's conditions on a run whose energy V is known.
 
-    V is the energy function of the stability proof. The quantities also include the gaps in the
-    log. `RunFacts.of_log` computes this object once for all checks.
+    V is the energy function of the stability theorem. The gaps in the log are also listed.
+    `RunFacts.of_log` computes this object once for all checks.
 
     Attributes:
         log: The log of the run.
         energies: Energies of every site, keyed by site name.
         balance: Energy balance of all sites together.
-        groups: Closed groups of sites, which follow no site outside their group, at the first
-            time at which there are several groups. The weights beta of the sites in V are then
-            not unique. Empty if the weights are always unique.
+        groups: Closed groups of sites, at the first time at which there are several of them.
+            The sites of a closed group follow no site outside the group. With several groups,
+            the weights beta of the sites in V are not unique. Empty if the weights are always
+            unique.
         absent: Time intervals in which a site was absent.
         unjudged: Time spans (start, end) in s in which records are missing although all sites
             were present.
@@ -143,17 +144,17 @@ class RunFacts(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log) -> "RunFacts":
-        """Computes the quantities needed to check the conditions of the theorem from a log.
+        """Computes from a log the quantities needed to check the stability theorem.
 
-        The stability theorem uses an energy function of all arms. If this function does not
-        exist for one of the control laws, or if the records of the arms overlap at too few
-        times to compute it, the result contains the reason.
+        The theorem is based on an energy function of all arms. If this function does not exist
+        for one of the control laws, or if the records of the arms overlap at too few times to
+        compute it, the result contains the reason.
 
         Args:
             log: The log of the run.
 
         Raises:
-            LogError: The log records an invalid change of the settings, such as of a dominance
+            LogError: The log contains an invalid change of a setting, such as a dominance
                 factor.
         """
         missing = MissingFunctional.list_of_scenario(log.scenario)

@@ -259,9 +259,11 @@ class RunningEnergy:
             records stores them here during the session.
         missing: Sites whose law or arm has no energy function, grouped by reason. If there are
             any, V cannot be computed.
-        degrades: True if shares change when a peer is lost, in which case V is not computed.
-        closed_groups: Names of the sites in two closed groups, which follow no site outside
-            their group. V is then not defined. Empty until two closed groups are found.
+        degrades: True if some site changes its dominance factors when it loses a peer, in which
+            case V is not computed.
+        closed_groups: Names of the sites in two closed groups. The sites of a closed group
+            follow no site outside the group. If there are two of these groups, V is not
+            defined. Empty until they are found.
     """
 
     def __init__(self, scenario: Scenario, kept_s: float = KEPT_S) -> None:
@@ -290,10 +292,10 @@ class RunningEnergy:
         ramps.extend(change.ramp for change in changes if change.ramp is not None)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
-        """Computes the energy V of all arms since the last call, if all records have arrived.
+        """Computes the energy V over the time since the last call, if all records have arrived.
 
-        V is the energy function of the stability proof. The result shows during a session
-        whether V rises.
+        V is the energy function of the stability proof for all arms together. The result shows
+        during a session whether V rises.
 
         Args:
             complete: For every site, the number of the last complete tick: every record up to

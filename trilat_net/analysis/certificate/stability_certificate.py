@@ -14,7 +14,7 @@ combines:
 
 Invariant:
     - The certificate names every question that a log cannot answer. If V does not exist, the
-      other evidence decides.
+      verdict is based on the other evidence.
     - Keys of the JSON output end in their unit, and unknown values are null.
     - The package `presentation` generates every sentence on request.
 """
@@ -103,7 +103,7 @@ class Certificate(Result):
         min_coverage: float = MIN_COVERAGE,
         own_laws: bool = False,
     ) -> "Certificate":
-        """Judges from a log whether a run was stable, and collects every reason.
+        """Judges from a log whether a run was stable, and collects all reasons for the verdict.
 
         The log may be incomplete or empty. The run is not repeated with small disturbances, and
         the characteristic roots of its linearised loop are not computed. These checks can be
@@ -111,8 +111,9 @@ class Certificate(Result):
 
         Args:
             log: The log of the run.
-            min_coverage: Smallest acceptable fraction of recorded ticks at each site. Below
-                this fraction, a run that would otherwise be judged stable is left open.
+            min_coverage: Smallest acceptable fraction of recorded ticks at each site. If the
+                fraction is smaller, the verdict on a run that would otherwise be judged stable
+                is "open".
             own_laws: True to execute the code of control laws that are not part of this
                 program, which is necessary to check the energies that they declare.
 
@@ -179,10 +180,10 @@ class Certificate(Result):
         """True if the energy V of the stability proof bounds the motion of every arm.
 
         This requires that V did not rise and that every arm has a positive weight in V. The
-        weight of an arm is zero if the arms that it follows do not follow it. The motion of
-        such an arm is still bounded if the dominance factors are constant and the condition on
-        these factors is the only one that fails. The arm then converges after the arms that it
-        follows have converged.
+        weight of an arm is zero if the arms that it follows do not follow it. The motion of an
+        arm with zero weight is still bounded if the dominance factors are constant, and if all
+        conditions of the stability theorem hold except the one on these factors. The arm then
+        converges after the arms that it follows have converged.
         """
         did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
         if self.balance is None or self.verdict.finding not in did_not_rise:
@@ -221,9 +222,9 @@ class Certificate(Result):
     def decision(self) -> StabilityDecision:
         """The decision on whether the run is stable, with the evidence for it.
 
-        The decision combines the motion at the end, the repetitions with small pushes, the
-        characteristic roots, the proofs and the doubts, according to the rules of
-        `stability_decision`. It is computed when first used.
+        The rules of `stability_decision` are applied to the motion at the end of the run, the
+        repetitions with small pushes, the characteristic roots, the proofs of stability, and
+        the findings that contradict a stable run. The decision is computed when first used.
         """
         findings = RunFindings(
             end=self.end,
@@ -249,11 +250,11 @@ class Certificate(Result):
 
     @property
     def proofs(self) -> tuple[str, ...]:
-        """Phrases that name the proofs for this loop, apart from its characteristic roots.
+        """Phrases that name the proofs of this loop's stability, apart from its roots.
 
         The stability theorem is a proof if all of its premises hold, constant delays remain
-        constant after the run, and V did not rise. The stability condition of a control law is
-        a proof if it holds at every site.
+        constant after the run, and the energy V did not rise. The stability conditions of the
+        control laws are a proof if all of them guarantee that all motions decay.
         """
         if not self._is_covered:
             return self.law_proofs
@@ -294,7 +295,7 @@ class Certificate(Result):
 
     @property
     def stability(self) -> Stability:
-        """The verdict on the run in one word: stable, settled, not stable, or open.
+        """The verdict on the run: stable, settled, not stable, or open.
 
         `stability_decision` explains how the findings lead to this verdict.
         """
@@ -310,7 +311,7 @@ class Certificate(Result):
         return self.accepts(())
 
     def headline(self) -> str:
-        """Returns the verdict and its basis as one line for people.
+        """Returns the verdict and the evidence for it as one line of text.
 
         An example is "stable: converged; rests on: exact roots, slowest -0.832 /s". The package
         `presentation` generates the line.

@@ -49,8 +49,9 @@ class FunctionalRise(NamedTuple):
         from_s: When V was at its minimum before the rise, in s.
         at_s: When V was highest, in s.
         amount: Size of the rise, in J.
-        causes: Energy that each source supplied during the rise, in J, in descending order.
-            Only sources that supplied more than 5 % of the rise are listed.
+        causes: Energy that each source inside the loop, such as a link, contributed to the
+            rise, in J, in descending order. Only contributions of more than 5 % of the rise are
+            listed.
     """
 
     from_s: float
@@ -60,9 +61,10 @@ class FunctionalRise(NamedTuple):
 
 
 class UnsuppliedGrowth(NamedTuple):
-    """Finding that the energy function V grew at the end of a run without supplied energy.
+    """Finding that V rose by more than the supplied energy until the end of a run.
 
-    V belongs to the stability proof and must not rise unless an operator or wall does work.
+    V is the energy function of the stability proof. It must not rise by more than the work of
+    operators and walls.
 
     Attributes:
         energy_j: Size of the growth, in J.
@@ -115,7 +117,8 @@ class UnclosedBalance(NamedTuple):
         from_s: Time from which the energies do not balance, in s.
         error_j: Largest error, in J.
         scale_j: Largest energy of the run, in J.
-        external: External arms, if only these are affected. Empty if the site is simulated.
+        external: Names of the external arms, if only they and arms that follow them are
+            affected. Empty otherwise.
         is_certain: True if the records are certainly wrong. Otherwise, the cause may be a tick
             period that is too long for the gains.
     """
@@ -152,8 +155,8 @@ class AmbiguousWeights(NamedTuple):
     follows every other arm, directly or through further arms.
 
     Attributes:
-        groups: Names of the sites in each closed group, which follows no site outside the
-            group.
+        groups: Names of the sites in each closed group. The sites of a closed group follow no
+            site outside the group.
     """
 
     groups: tuple[tuple[str, ...], ...]
@@ -180,7 +183,7 @@ class FunctionalCourse(NamedTuple):
 
     Attributes:
         failed: Names of the premises that fail. If there are any, the theorem does not apply.
-        undecided: Quantities of the premises for which the log does not show whether they hold.
+        undecided: Quantities of the premises that the log neither confirms nor refutes.
         external: Names of the external sources that did work, such as "hands" or "walls".
         from_s: First time at which V is known, in s.
         to_s: Last time at which V is known, in s.
@@ -249,7 +252,8 @@ class Evidence(NamedTuple):
         functional_share: Fraction of the tick periods in which the energy of the stability
             proof is known from records, excluding periods in which a site was absent. `None` if
             this energy is not judged.
-        min_coverage: Smallest sufficient fraction, for both ticks and periods.
+        min_coverage: Smallest sufficient fraction, both of recorded ticks and of tick periods
+            in which the energy is known.
     """
 
     log: LogQuality

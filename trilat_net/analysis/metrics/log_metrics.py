@@ -105,14 +105,14 @@ class LogMetrics(Result):
     def of_log(cls, log: Log) -> "LogMetrics":
         """Computes all metrics of a recorded run, such as the largest error of each arm.
 
-        The log may be truncated, short or empty. A value that the log does not determine is
-        replaced by the reason.
+        The log may be truncated, short or empty. If the log does not determine a value, the
+        reason is stated in place of the value.
 
         Args:
             log: The log of the run.
 
         Raises:
-            LogError: A record cannot be read, or names an invalid change.
+            LogError: A record cannot be read, or a recorded change is invalid.
         """
         view = RunView(log)
         scenario = log.scenario
@@ -145,7 +145,7 @@ class LogMetrics(Result):
 
     @classmethod
     def find_quantity(cls, key: str) -> Quantity:
-        """Returns the name, unit and meaning of the metric with a key such as "rms_error_rad".
+        """Returns the name, unit and meaning of a metric, given a key such as "rms_error_rad".
 
         Args:
             key: Key of the metric in JSON output and tables.
@@ -179,7 +179,7 @@ class LogMetrics(Result):
 
         Raises:
             KeyError: One of the keys is not the key of a quantity.
-            LogError: A record cannot be read, or names an invalid change.
+            LogError: A record cannot be read, or a recorded change is invalid.
         """
         requested = {key: LogMetrics.find_quantity(key) for key in keys}
         needed_measures = []
@@ -203,15 +203,15 @@ class LogMetrics(Result):
     ) -> dict[str, float]:
         """Finds the largest distance between each site and its peers at any one time.
 
-        The tracking error compares a site with samples that its peers sent some time ago. This
-        distance compares the site with its peers at the same time, and thus includes the effect
-        of the delay.
+        For the tracking error, a site is compared with samples that its peers sent some time
+        ago. For this distance, the site is compared with its peers at the same time. The
+        distance therefore includes the effect of the delay.
 
         Args:
             log: The log of the run.
             sites: Names of the sites.
             other: Log of a run with the same sites, such as a rerun. If given, only times at
-                which this run also has a record of the site are used.
+                which both runs have a record of the site are used.
 
         Returns:
             The largest distance by site, in rad, or in m if the sites share positions. Sites
@@ -219,7 +219,7 @@ class LogMetrics(Result):
             site, are missing.
 
         Raises:
-            LogError: A record cannot be read, or names an invalid change.
+            LogError: A record cannot be read, or a recorded change is invalid.
         """
         view = RunView(log)
         maxima = {}
@@ -249,7 +249,7 @@ class LogMetrics(Result):
         """Returns the unit of a quantity at a joint or along a spatial axis.
 
         If the arms follow each other with their end effectors, the first three numbers stand
-        for spatial axes. A quantity in N m at a joint is then, for example, a force in N.
+        for spatial axes. A torque in N m at a joint then becomes a force in N along an axis.
 
         Args:
             joint_unit: Unit of the quantity at a joint.
@@ -262,7 +262,7 @@ class LogMetrics(Result):
     def headline(self) -> str:
         """Returns one line with the log, the number of known values, and the sites.
 
-        An example is "run.mcap: 84 numbers of paper, m1, m2, s".
+        An example is "run.mcap: 84 numbers of paper, m1, m2, s", where "paper" is the scenario.
         """
         known = 0
         for _, metric in self._list_values():
@@ -274,9 +274,9 @@ class LogMetrics(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns the metrics as plain values, with the keys of `trilat metrics --json`.
 
-        Each subject has its own dictionary: `["sites"]["m1"]` maps the keys of metrics to their
-        values for site m1. An unknown value is `None`, and the entry "unknown" contains the
-        reason.
+        Each site, link or wall has its own dictionary: `["sites"]["m1"]` maps the keys of
+        metrics to their values for site m1. An unknown value is `None`, and the entry "unknown"
+        contains the reason.
         """
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,

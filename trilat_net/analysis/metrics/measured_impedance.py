@@ -96,7 +96,7 @@ class FrequencyResponse(NamedTuple):
         rate_hz: int,
         least: float,
     ) -> "list[FrequencyResponse]":
-        """Estimates the ratio of an output to an input at every frequency that is driven.
+        """Estimates the ratio of an output to an input at every sufficiently driven frequency.
 
         Both signals are caused by a third one, the drive, and are compared through their
         cross-spectra with it. `scipy.signal.csd` is not used, because it cannot skip segments
@@ -111,8 +111,9 @@ class FrequencyResponse(NamedTuple):
             least: Smallest drive amplitude at which a frequency counts as driven.
 
         Returns:
-            The responses, beginning with that of the strongest drive. If no frequency is
-            driven, a single response that contains the reason.
+            The responses, beginning with the one at the frequency with the strongest drive. If
+            there is no usable segment or no sufficiently driven frequency, a single response
+            that contains the reason.
         """
         length = round(SEGMENT_S * rate_hz)
         starts = _find_segments(usable, length)

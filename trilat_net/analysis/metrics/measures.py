@@ -96,7 +96,7 @@ def measure_shared(
     at_end: NDArray[np.bool_],
     why_not_at_end: str = _NOT_FINITE,
 ) -> MetricValues:
-    """Measures how far the motions of two sites differ: RMS, peak, and peak at the end.
+    """Measures how much the motions of two sites differ: RMS, peak, and peak at the end.
 
     Sites share joint angles in rad, positions of their end effectors in m, or complete poses,
     which have both units. Quantities whose unit does not occur are marked as not applicable.
@@ -198,7 +198,7 @@ class Quantity(NamedTuple):
 
     @classmethod
     def list_shared(cls, names: Mapping[str, str]) -> list["Quantity"]:
-        """Defines quantities of the coordinates that arms share, for angles and for positions.
+        """Defines quantities both for shared joint angles and for shared positions.
 
         Arms share either their joint angles, in rad, or the positions of their end effectors,
         in m. Each quantity is therefore defined twice.

@@ -109,22 +109,22 @@ def _measure_tracking(view: RunView, site: str) -> MetricValues:
 
 @measures("site", UNDELAYED, *Quantity.list_shared(_UNDELAYED_ERRORS))
 def measure_undelayed_error(view: RunView, site: str, other: Log | None = None) -> MetricValues:
-    """Measures how far a site is from where its peers are at the same time.
+    """Measures how far a site is from the weighted mean of its peers at the same time.
 
-    The error e of a site compares its coordinates with those that its peers sent some time ago.
-    The undelayed error compares them with the peers' coordinates at the same time t, weighted
-    by the dominance factors:
+    The error e of a site is the difference between its coordinates and those that its peers
+    sent some time ago. For the undelayed error, the coordinates of the peers at the same time t
+    are used instead, weighted by the dominance factors:
 
         q_i(t) - sum_j alpha_ij(t) q_j(t)
 
-    It therefore includes the effect of the delay. The motion of a peer is interpolated between
-    its ticks.
+    The undelayed error therefore includes the effect of the delay. The motion of a peer is
+    interpolated between its ticks.
 
     Args:
         view: The run.
         site: Name of the site.
         other: Log of a run with the same sites, such as a rerun, which may end earlier. If
-            given, only times at which this run also has a record of the site are used.
+            given, only times at which both runs have a record of the site are used.
     """
     followed = _list_followed_peers(view, site)
     missing = [name for name in (site, *followed) if name not in view.sites]
@@ -436,7 +436,8 @@ class ParameterEstimates(NamedTuple):
         last: Estimates in the last record.
         slope_per_s: Slopes of straight lines fitted to the last 5 s, in 1/s, or `None` with
             fewer than two records.
-        base: Estimates of a chain in base parameters, or `None` for the planar arm.
+        base: Estimates of the base parameters, which are the combinations of parameters that
+            torques determine. `None` for the planar arm.
     """
 
     learnt: list[bool]

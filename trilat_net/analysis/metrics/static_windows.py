@@ -201,8 +201,8 @@ def _average_window(
 class StiffnessEstimate(NamedTuple):
     """Stiffness that an operator felt at a joint, between two consecutive static windows.
 
-    All arms are at rest in a static window. The stiffness is the change of torque divided by
-    the change of angle, for example of an arm that leans against a wall.
+    All arms are at rest in a static window. The stiffness is the change of the operator's
+    torque divided by the change of the joint angle.
 
     Attributes:
         from_s: End of the first window, in s.
@@ -329,9 +329,10 @@ class SharingRatio(NamedTuple):
         """Compares the torque that an operator feels with the torque on another arm.
 
         The comparison is made at every joint at which exactly two arms are loaded, while all
-        arms are at rest. The operator modelled as a spring, at a site without an environment,
-        is taken to feel the torque that acts on the other arm. If this describes both sites or
-        neither, the operator of the master is taken to feel the torque.
+        arms are at rest. One of the two operators is assumed to feel the torque that acts on
+        the other arm: the operator who is modelled as a spring, at a site without an
+        environment. If this condition is met at both sites or at neither, the operator of the
+        master is chosen.
 
         Args:
             view: The recorded run.

@@ -300,10 +300,11 @@ class CharacteristicRoot(NamedTuple):
 
 
 class Spectrum(NamedTuple):
-    """The rightmost characteristic roots of a loop, which decide its stability.
+    """The rightmost characteristic roots of a loop, which determine its stability.
 
-    Some roots are zero because of the structure of the loop: all arms can also rest in other
-    poses, or nothing excites an estimate. These structural zeros say nothing about stability.
+    Some roots are zero because of the structure of the loop, for example because all arms can
+    also rest in other poses, or because nothing excites a parameter estimate. These structural
+    zeros say nothing about stability.
 
     Attributes:
         roots: The rightmost roots other than structural zeros, in descending order of real
@@ -311,7 +312,7 @@ class Spectrum(NamedTuple):
         zeros: Number of structural zeros.
         drifting: Number of structural zeros without an eigenvector of their own. Their modes
             grow with time.
-        dropped: Number of guesses for which Newton's method reached no root.
+        dropped: Number of guesses from which Newton's method did not converge to a root.
         order: Order of the discretisation that supplied the guesses. 0 if none was needed.
         span_s: Time over which the roots are computed, in s: the period after which delays and
             tick rates repeat, or the analysed span of delays that do not repeat. `None` if all

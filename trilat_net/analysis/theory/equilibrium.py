@@ -392,20 +392,22 @@ def _project_on_zero_roots(loop: LinearLoop, deviation: Array) -> Array | None:
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
     """Finds a pose in which all arms of a scenario are at rest, as a basis for linear analysis.
 
-    The result is the pose nearest to the end of a run, or a pose that the user supplies.
+    The result is the equilibrium nearest to the final pose of a simulated run, or a pose that
+    the user supplies.
 
     Args:
         scenario: The scenario.
         pose: Pose in which all arms are at rest: one angle per joint in rad, or in task space
             the pose of the end effectors. The estimates of the arm parameters are then assumed
-            to be correct. If `None`, the equilibrium at the end of a run is used.
+            to be correct. If `None`, a run is simulated, and the equilibrium nearest to its
+            final pose is used.
 
     Returns:
         The equilibrium, with remarks for the user.
 
     Raises:
-        ScenarioError: The scenario cannot be linearised, or has no equilibrium near the end of
-            its run.
+        ScenarioError: The scenario cannot be linearised, or has no equilibrium near the final
+            pose of its run.
         UsageError: The pose does not have the expected number of finite values.
     """
     conditions = OperatingConditions.derive(scenario)
@@ -537,11 +539,11 @@ def _iterate_memories(
 
 
 def settle_memories(conditions: OperatingConditions, state: Equilibrium) -> Equilibrium:
-    """Returns a state in which the memories of imported laws are consistent with its pose.
+    """Returns a state in which the memories of imported laws are consistent with the pose.
 
-    The memory of an imported law (a law written by a user) is stored in place of its estimate.
-    It starts with its initial value, and the law is called in the pose of the state until the
-    memory is constant. The estimates of other laws remain unchanged.
+    The memory of an imported law (a law written by a user) is stored in place of parameter
+    estimates. Starting from its initial memory, the law is called repeatedly with the arms in
+    the given pose, until the memory is constant. The estimates of other laws remain unchanged.
 
     Args:
         conditions: The sites, gains and delays of the loop.

@@ -142,7 +142,7 @@ def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> _SiteTickMa
     Phi, Gamma = _discretise_arm(jacobian, h_s)
 
     def compute_control(arguments: Array) -> Array:
-        """Returns the contribution of the controller to the state of a site during one tick.
+        """Returns the contribution of the controller to a site's state at the next tick.
 
         The controller torque moves the arm, and the parameter estimates change. The torque of
         this tick is kept for the next tick if the integration scheme needs it. The contribution
@@ -318,8 +318,8 @@ class SamplesInUse(NamedTuple):
             the number 0.
         period_s: Time after which the pattern of ticks and delays repeats, in s, or `None` if
             it does not repeat. The span is an integer multiple of this period.
-        is_exact: True if the pattern repeats exactly, False if it repeats to within half a tick
-            or not at all.
+        is_exact: True if the pattern repeats exactly, False if it repeats only to within half a
+            tick or not at all.
     """
 
     span_s: float
@@ -332,8 +332,8 @@ class SamplesInUse(NamedTuple):
         """Finds which samples of the other sites each site uses, at every tick of a time span.
 
         The pattern of used samples repeats after some time, and the span consists of complete
-        repetitions. For random delays, which never repeat, the span has a fixed length and its
-        delays are drawn.
+        repetitions. For random delays, which never repeat, the span has a fixed length, and its
+        delays are drawn at random.
 
         Args:
             conditions: The sites, their tick rates, and the links between them.
@@ -823,8 +823,8 @@ class SampledLoop:
     """Linear model of coupled arms whose controllers act once per tick.
 
     The model can be evaluated at several equilibria. The modes about one equilibrium are a good
-    starting point for the search for the modes about another one nearby, which then takes half
-    the time.
+    starting point for finding the modes about a nearby equilibrium, which then takes half the
+    time.
 
     Args:
         conditions: The sites, gains and delays. All control laws must permit linearisation tick

@@ -179,12 +179,13 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
 def refine_response(response: PortResponse, w_rad_s: Array) -> tuple[Array, PortResponse]:
     """Adds frequencies until a response changes little from one frequency to the next.
 
-    The relative change is at most a tenth. The number of points is limited. At a pole on the
-    imaginary axis, refinement stops when two points differ by a millionth.
+    The relative change from point to point is at most a tenth, unless the number of points
+    reaches a limit. At a pole on the imaginary axis, refinement stops when two neighbouring
+    frequencies differ by only a millionth.
 
     Several analyses evaluate the response at the refined frequencies. The returned response
-    therefore has cached values there. It uses them only if its argument is the same array
-    object as the returned frequencies.
+    therefore has cached values there. The cached values are used only if the response is called
+    with the returned array of frequencies itself, not with a copy.
 
     Args:
         response: The response as a function of frequency.

@@ -195,7 +195,7 @@ class LinearAnalysis(Result):
 
     @property
     def is_far_from_rest(self) -> bool:
-        """True if the run ends too far from the analysed equilibrium to be judged by it.
+        """True if the run ends too far from the equilibrium for the analysis to apply to it.
 
         The limit is `NEAR_REST_RAD`. False for a scenario without a run, which has no final
         pose.
@@ -245,7 +245,8 @@ class LinearAnalysis(Result):
     def to_dict(self) -> dict[str, Any]:
         """Converts the analysis to the plain values that `trilat linear --json` prints.
 
-        Parts that were not requested, or that do not exist for this loop, are `None` or empty.
+        Results that were not requested, or that were not computed because of the kind of loop,
+        are `None` or empty.
         """
         sampled = None
         if self.sampled is not None:
@@ -326,7 +327,8 @@ class LinearAnalysis(Result):
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
         """Finds the root of the sampled loop that corresponds to a root of the continuous loop.
 
-        This is the nearest root. It is only worth showing if the two roots differ.
+        The nearest root is chosen. It is left out if the two roots are nearly equal, because
+        showing both would then be redundant.
 
         Args:
             root: A root of the continuous loop.

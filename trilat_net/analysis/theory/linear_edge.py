@@ -126,9 +126,9 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
     """Returns the growth rate of small motions while an arm touches a wall, in 1/s.
 
     Only sampled walls, which compute their force once per tick, are considered. The arms are
-    linearised at the equilibrium nearest to the state of a run that is deepest in a wall. The
-    mean of the states is not suitable, because a chattering arm leaves the wall again and
-    again.
+    linearised at the equilibrium nearest to the state in which an end effector has penetrated a
+    wall most deeply. The mean of all states is not suitable, because a chattering arm leaves
+    the wall again and again.
 
     Args:
         scenario: The scenario.
@@ -211,7 +211,7 @@ class EdgeScan(NamedTuple):
             ) from None
 
     def scan(self, scenario: Scenario, rest: Equilibrium) -> "EdgeScan":
-        """Returns this range with the values at which the arms become stable or unstable.
+        """Returns a copy that contains the values at which the arms become stable or unstable.
 
         Args:
             scenario: The scenario.
@@ -361,9 +361,9 @@ class _GrowthRate:
             The value at which stability changes, with the frequency of the motion.
 
         Raises:
-            ScenarioError: For a value in between, the scenario cannot be linearised.
-            ValueError: When evaluated again, the arms are stable at both values, or unstable at
-                both.
+            ScenarioError: The scenario cannot be linearised for a value in between.
+            ValueError: The arms turn out to be stable at both values, or unstable at both, when
+                their stability is evaluated again.
         """
         low = left.value
         high = right.value
@@ -391,7 +391,7 @@ class _GrowthRate:
 class GrowthColumn(NamedTuple):
     """Growth rate of small motions of coupled arms, for several values of one setting.
 
-    A positive rate means that the arms are unstable at this value.
+    Where the rate is positive, the arms are unstable.
 
     Attributes:
         growth_per_s: Growth rate for each value, in 1/s: the real part of the rightmost
@@ -434,8 +434,9 @@ class GrowthColumn(NamedTuple):
                 case.
 
         Returns:
-            The growth rates, and the values at which stability changes. Such a value is missing
-            if the setting does not permit the values that the search needs.
+            The growth rates, and the values at which stability changes. A value at which
+            stability changes is left out if the search for it fails, for example because the
+            setting does not permit the intermediate values.
         """
         rest: Equilibrium | None = None
         column = GrowthColumn([], {}, [])
@@ -481,8 +482,8 @@ class GrowthColumn(NamedTuple):
         An example is the smallest damping gain with which the arms are stable.
 
         Args:
-            scenario: The scenario. The equilibrium is determined with the value that the
-                scenario itself gives to the setting.
+            scenario: The scenario. The equilibrium is determined for the value that the setting
+                has in this scenario.
             key: Name of the setting, such as "control.d".
             low: Smallest value to examine.
             high: Largest value to examine.

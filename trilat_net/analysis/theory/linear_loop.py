@@ -146,8 +146,8 @@ class DelayedTerm(NamedTuple):
 class LinearLoop(NamedTuple):
     """Linear model of the coupled arms near an equilibrium, with network delays.
 
-    It shows whether small motions about the equilibrium grow. The docstring of the module has
-    the equation and the notation.
+    It shows whether small motions about the equilibrium grow. The docstring of the module
+    states the equation and the notation.
 
     Attributes:
         names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".
@@ -263,7 +263,8 @@ class LinearLoop(NamedTuple):
         The torque u_c of the clamp makes the arm's accelerations zero: u_c = -B_cc^-1 (A_c x +
         B_c u + delayed terms), where x is the state, u the other torques, A_c and B_c the rows
         of the loop's matrices for these accelerations, and B_cc the part of B_c that belongs to
-        the arm's own torques. The torque acts wherever the law uses the torque of this arm.
+        the arm's own torques. This torque replaces the operator torque of the clamped arm in
+        all terms of the model, including the delayed terms.
 
         Args:
             site: Name of the site.
@@ -513,8 +514,8 @@ def compute_couplings(
     """Computes how the values that each site sends act on the inputs of the other sites.
 
     A site sends its pose, its velocity and its reflected torque, with m entries each. A
-    receiver weights them with its dominance factors. The control law of a user also receives
-    them unweighted.
+    receiver weights them with its dominance factors. A control law written by a user also
+    receives the unweighted values.
 
     Args:
         conditions: The sites, gains and delays of the coupled arms.
@@ -615,7 +616,7 @@ def _replace_estimate(
     estimate = layout.estimate
 
     def convert(derivative: Array) -> Array:
-        """Converts derivatives by the estimates theta_hat to derivatives by z = T theta_hat."""
+        """Converts derivatives with respect to theta_hat to those with respect to z."""
         motion = derivative[:, : estimate.start]
         by_estimate = derivative[:, estimate]
         by_z = by_estimate @ estimate_by_z

@@ -59,8 +59,8 @@ class NumericLaw:
     """A user's control law as a function that the linear analysis can differentiate.
 
     The memory of the law consists of the values that it stores from one tick to the next. The
-    law object is built only once and returned by every call of this object, which can therefore
-    replace the function that normally builds the law of a `SiteSetup`.
+    law object is built only once. Calling a `NumericLaw` returns this law object, so a
+    `NumericLaw` can replace the function that normally builds the law of a `SiteSetup`.
 
     Args:
         setup: Setup of the site.

@@ -112,8 +112,8 @@ class OperatingConditions(NamedTuple):
         notes: Remarks for the user on quantities that were left out or fixed.
         varying: True if ages vary during the run. `age_s` then contains their means.
         laws: Control law of each site.
-        links: For each pair (i, j), the link from j to i in effect, and the key of its random
-            draws.
+        links: For each pair (i, j), the link from j to i that is in effect, and the key of its
+            random draws.
     """
 
     sites: tuple[SiteSetup, ...]
@@ -516,8 +516,9 @@ def compute_effective_delay(
 ) -> _EffectiveDelay:
     """Computes how old a peer's state is when a control loop uses it.
 
-    The ages are those in the run. If the delay has a longer period than the run, the ages in a
-    full period are used, because the loop is assumed to continue after the run.
+    The ages during the run are used. If the period of the delay is longer than the run, the
+    ages during a full period are used instead, because the loop is assumed to continue after
+    the run.
 
     Args:
         scenario: The scenario.

@@ -235,7 +235,7 @@ class PortAnalysis(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The place where an operator pushes an arm: "joint", or "axis" in task space."""
+        """Kind of ports at which operators push the arms: "joint", or "axis" in task space."""
         return "axis" if self.axes else "joint"
 
     @property
@@ -249,7 +249,7 @@ class PortAnalysis(NamedTuple):
         The two-ports of a group have the same sites, and the same third site clamped (or none).
 
         Args:
-            by_joint: True to also separate the joints.
+            by_joint: True to put two-ports of different joints into different groups.
         """
         groups: dict[tuple[object, ...], list[_TwoPort]] = {}
         for two_port in self.two_ports:

@@ -65,7 +65,7 @@ _WEIGHT_TOLERANCE = 1e-3
 
 
 class Passivity(NamedTuple):
-    """Whether coupled arms are passive: they never supply net energy to their operators.
+    """Whether coupled arms are passive, meaning that they never supply net energy.
 
     Y is the admittance over frequency: the velocity at the operators' joints per unit torque.
     The arms are passive if Y + Y^H has no negative eigenvalue, where Y^H is the conjugate
@@ -86,7 +86,7 @@ class Passivity(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if the arms are passive at all analysed frequencies: they never supply energy.
+        """True if the arms are passive (never supply net energy) at all analysed frequencies.
 
         This means that Y + Y^H has no negative eigenvalue, where Y is the admittance of the
         ports and Y^H its conjugate transpose.
@@ -168,7 +168,7 @@ class HandMatrices(NamedTuple):
     def read(cls, file: Path) -> "HandMatrices":
         """Reads the measured mass, damping and stiffness of a person's hand from a JSON file.
 
-        Stability can then be checked against this hand instead of every passive operator, which
+        Stability can then be checked for this hand instead of for every passive operator, which
         is a less strict condition.
 
         Args:
@@ -238,7 +238,7 @@ def check_against_hands(
     Z = Y^-1, and D is the resistance of the operators at the ports. If the eigenvalue is not
     negative at any frequency, Z together with D is passive, and each operator without D is also
     passive. The loop is then stable with any of these operators, and with passive environments
-    at the other ports. Like passivity, this condition is sufficient.
+    at the other ports. This condition is sufficient but not necessary, as is passivity.
 
     Args:
         response: Admittance Y at the ports.
@@ -310,7 +310,7 @@ def find_least_eigenvalue(Y: Complex) -> Array:
     """Returns the smallest eigenvalue of Y + Y^H at each frequency, shape (F,).
 
     Y is the admittance, which maps torques to velocities, and Y^H its conjugate transpose. If
-    the eigenvalue is never negative, the arms are passive: they never supply energy to
+    the eigenvalue is never negative, the arms are passive: they never supply net energy to
     operators.
 
     Args:
@@ -358,8 +358,9 @@ def llewellyn_parameter(Y: Complex) -> Array:
     """Returns Llewellyn's parameter of two scalar ports, shape (F,).
 
     The parameter is (2 Re y11 Re y22 - Re(y12 y21)) / abs(y12 y21). The criterion of absolute
-    stability requires at least 1. The parameter is at most `MAX_LLEWELLYN`, the value for two
-    ports without transmission, and at most -1 if Re y11 or Re y22 is negative.
+    stability requires a parameter of at least 1. Values above `MAX_LLEWELLYN`, which occur if
+    almost nothing is transmitted between the ports, are replaced by this limit. If Re y11 or Re
+    y22 is negative, the result is at most -1.
 
     Args:
         Y: Admittance, shape (F, 2, 2).
@@ -451,14 +452,14 @@ class _BestWeights(NamedTuple):
 
 
 def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> _BestWeights:
-    """Finds the site weights that best prove absolute stability, at each frequency.
+    """Finds the site weights for the sharpest test of absolute stability, at each frequency.
 
     Each site has one positive weight, shared by all its ports (places where operators act). D
     is the diagonal matrix of these weights. The loop is stable with any passive operators if
     the matrix H = D^1/2 Y D^-1/2 + (D^1/2 Y D^-1/2)^H has no negative eigenvalue, where ^H is
     the conjugate transpose. The smallest eigenvalue of H is concave in ln D (compare Sezginer
-    and Overton, IEEE Trans. Automatic Control 35 (1990)), which lets the ellipsoid method find
-    its maximum.
+    and Overton, IEEE Trans. Automatic Control 35 (1990)). The ellipsoid method can therefore
+    find its maximum.
 
     Args:
         Y: Admittance (velocity per unit torque) of the p ports at F frequencies, shape (F, p,

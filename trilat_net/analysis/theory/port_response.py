@@ -72,7 +72,7 @@ class LoopOutput(NamedTuple):
     delayed: tuple[tuple[float, Array], ...] = ()
 
     def evaluate(self, s: Complex) -> Complex:
-        """Returns the matrix from the state of the arms to an output at complex frequencies s.
+        """Returns the matrix that maps the state of the arms to an output, at frequencies s.
 
         The matrix is C + sum_k C_k e^{-s T_k}, with the network delays T_k.
 
@@ -253,7 +253,7 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
 
 
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
-    """Restricts a frequency response to some joints, at which operators act.
+    """Restricts a frequency response to the joints at which operators act.
 
     No operator acts at the other joints. Their torque is zero, and their rows and columns are
     removed.
@@ -283,7 +283,7 @@ _PER_DECADE = 100
 
 
 class Transparency(NamedTuple):
-    """How much of another arm an operator feels: the impedance with this arm free and clamped.
+    """How much of another arm an operator feels: the impedance with that arm free or clamped.
 
     A transparent system feels light while the other arm is free, and stiff while the other arm
     is clamped.

@@ -33,8 +33,8 @@ _NO_ROOT_PER_S = -1e3
 class RestingLoop:
     """The linearised control loop of arms at rest in one common pose.
 
-    `find_root` predicts how fast small motions grow, and `measure_growth` determines it from a
-    simulated run.
+    `find_root` predicts how fast small motions grow, and `measure_growth` measures how fast
+    they grow in a simulated run.
 
     Attributes:
         conditions: Tick rates of the arms, and the delays between them.
@@ -83,7 +83,7 @@ class RestingLoop:
         return age_ticks / self.rate_hz
 
     def fix_age(self, age_s: float) -> "RestingLoop":
-        """Returns the loop with the same constant age of all samples, in place of varying ages.
+        """Returns the loop with one constant age for all samples, in place of varying ages.
 
         Args:
             age_s: The age, in s.

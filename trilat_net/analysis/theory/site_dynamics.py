@@ -43,7 +43,8 @@ class ArgumentLayout:
     Args:
         joints: Number of joints n, the length of q, qd and the external torque.
         parameters: Length of the estimate.
-        shared: Length m of each part that comes from peers. If 0, m is the number of joints.
+        shared: Length m of each quantity that comes from peers. If 0, m is the number of
+            joints.
         peers: Number of peers whose samples an imported law also reads individually.
 
     Attributes:
@@ -55,7 +56,7 @@ class ArgumentLayout:
         external_torque: Torque that an operator adds at the joints.
         inputs: All values from peers: the reference, its derivative, their torque, and then the
             samples of the individual peers.
-        coordinates: Length m of each part that comes from peers.
+        coordinates: Length m of each quantity that comes from peers.
         states: Length of the site's state: q, qd and theta_hat.
         arguments: Length of the complete vector.
     """
@@ -299,8 +300,8 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
 def compute_reflected_torque(site: SiteSetup, x: Numbers) -> Numbers:
     """Computes the torque of operators and walls that an arm sends to the other arms.
 
-    This torque lets a user feel what another arm touches. It is the entry `reflected` of
-    `SiteRates.evaluate`, without the other entries.
+    This torque lets a user feel what another arm touches. The result equals `reflected` in the
+    result of `SiteRates.evaluate`, but the other quantities are not computed.
 
     Args:
         site: Setup of the site.

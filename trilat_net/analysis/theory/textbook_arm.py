@@ -795,8 +795,8 @@ class Following(NamedTuple):
             torque: Torque tau at the n joints, shape (n, ...), in N m.
 
         Returns:
-            The force, shape (m, ...). If joints follow instead of the end effector, the
-            argument itself.
+            The force, shape (m, ...). If the arm follows with its joints instead of its end
+            effector, the argument is returned unchanged.
         """
         if self.J is None or self.A is None:
             return torque

@@ -58,7 +58,7 @@ _LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
 class EnvelopeTrend(Enum):
     """Trend of the magnitude of an oscillation in the second half of a run.
 
-    The docstring of the module defines the classes.
+    The docstring of the module defines each member.
     """
 
     DECAYS = auto()
@@ -75,8 +75,8 @@ class EnvelopeFit(NamedTuple):
 
     Attributes:
         trend: Class of the trend, such as growing or decaying.
-        rate_per_s: Rate of the envelope, which is proportional to exp(rate t), in 1/s. NaN if
-            the record is too short.
+        rate_per_s: Growth rate, in 1/s, of the exponential exp(rate t) that is fitted to the
+            envelope. NaN if the record is too short.
         calm: True if the envelope is not about to grow. Two conditions must hold. First, the
             envelope falls, or its rise within the second half of the run is certainly less than
             a quarter. Second, its maximum in the last quarter of this half is at most 1.5 times
@@ -98,7 +98,7 @@ class EnvelopeFit(NamedTuple):
     ) -> "list[EnvelopeFit]":
         """Determines whether oscillations grow, decay or persist in the second half of a run.
 
-        The docstring of the module defines these classes.
+        The docstring of the module defines the possible trends.
 
         Args:
             t_s: Times in ascending order, shape (K,), in s.
@@ -228,7 +228,7 @@ def _classify_trend(
 ) -> EnvelopeTrend:
     """Returns whether an amplitude grows, decays or persists, from a fitted line and its error.
 
-    The docstring of the module defines these classes.
+    The docstring of the module defines the possible trends.
 
     Args:
         change: Change of the envelope's logarithm over the half, according to the line.

@@ -253,8 +253,8 @@ class TwinGrowth(NamedTuple):
     def miss_chance(self) -> _MissChance | None:
         """Probability that random pushes fail to reveal that a run is unstable.
 
-        `None` if each joint was pushed individually, because such pushes have no random
-        direction.
+        `None` if each joint was pushed individually, because the directions of the pushes are
+        then not random.
         """
         directions = {push.push.direction for push in self.pushes if push.push.direction}
         if not directions:
@@ -277,9 +277,9 @@ class TwinGrowth(NamedTuple):
     def needs_s(self) -> float | None:
         """Length of a run that would clearly show that the effects of pushes decay, in s.
 
-        In a run of this length, the difference that decays most slowly can halve four more
-        times at its present rate. `None` if the differences do not decay, or if the run is
-        already long enough.
+        In a run of this length, the effect that decays most slowly can halve four more times at
+        its present rate. `None` if the effects do not decay, or if the run is already long
+        enough.
         """
         worst = self.worst
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
@@ -416,7 +416,7 @@ class TwinGrowth(NamedTuple):
             counts_from_s: Only the run after this time is considered, in s. The second half of
                 the time after it is judged.
             quiet_from_s: Time after which no operator acts on the run and its control loop does
-                not change, in s. Departures from rest are searched for after this time.
+                not change, in s. Only departures from rest after this time are searched for.
         """
         t_s = twins.paths[0].t_s
         has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
@@ -841,8 +841,10 @@ class PushedTwins(Result):
             log: The log.
             at_s: Time of the pushes, in s.
             push: Sizes by target, as in `{"m1.q1": 1e-6}`, or strings such as "m1.q1=1e-6".
-                Each push makes one twin. By default the pushes are those of a certificate.
-            delta: Range of sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+                Each push is made in a separate repetition of the run. By default, the pushes
+                are the same as for a certificate.
+            delta: Range of sizes of a single push, as in "1e-9:1e-3". The run is repeated once
+                per decade.
 
         Raises:
             UsageError: A target does not exist, or a time, size or range is not allowed.
@@ -911,7 +913,7 @@ class PushedTwins(Result):
     def describe(self, pushed: PushGrowth) -> str:
         """Returns a sentence for the user on whether the effect of a push grows or decays.
 
-        The sentence names the push, such as its joint and size, and the rate.
+        The sentence states the push (for example its joint and size) and the rate.
 
         Args:
             pushed: The push and its effect.
