@@ -64,7 +64,7 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
 
 
 def find_package(group: str, name: str) -> str:
-    """Returns the optional package, such as trilat-studies, that defines a name.
+    """Returns the optional package, such as trilat-studies, that defines a given name.
 
     Error messages tell the user to install this package. Returns "" if no optional package
     defines the name.
@@ -111,7 +111,7 @@ def load_entry(group: str, name: str, use: str) -> Any:
 
 
 def find_viewer(name: str) -> Callable[[Sequence[Path]], None]:
-    """Returns the function with which another package displays logs (group `VIEWS`).
+    """Returns the function by which another package displays logs (group `VIEWS`).
 
     The function takes the paths of the log files, and returns once the log is displayed.
 

@@ -89,7 +89,7 @@ class TrilatError(Exception):
 class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
     """A name that does not exist in a result, for example of an arm that is not in a log.
 
-    This is also a KeyError, so that a result behaves like a dictionary.
+    This error is also a KeyError, so that a result behaves like a dictionary.
     """
 
     exit_code = 2
@@ -118,11 +118,11 @@ class ScenarioError(TrilatError):
 
 
 class CodeWithheld(ScenarioError):  # noqa: N818 - it names an outcome
-    """User code named in a log that is not allowed to run on this machine.
+    """User code that a log names, but that is not allowed to run on this machine.
 
     The code is a control law, an operator (a program that moves an arm) or a plant (a
-    simulation of an arm). The user of this machine must allow it first, because a log from
-    another person may name harmful code.
+    simulation of an arm). The user of this machine must allow the code first, because a log
+    from another person may name harmful code.
     """
 
     exit_code = 4
@@ -141,7 +141,7 @@ class WireError(TrilatError):
     """A network message from another machine that is not a valid message of this program.
 
     The receiver drops the message and counts it. The sender may be another program, or another
-    version of this one.
+    version of this program.
 
     Args:
         reason: Category under which the rejected payload is counted.

@@ -35,9 +35,9 @@ class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     def find_kinds(cls, package: str) -> Iterator[type[Self]]:
         """Yields the subclasses that a scenario can select by name, as in `kind = "wall"`.
 
-        A new kind is added by adding a file to the package. Classes without a tag (name) of
-        their own serve only as base classes and are skipped. The classes are ordered by file,
-        and by position within each file.
+        Adding a file with a subclass to the package makes the subclass available. Classes
+        without a tag (name) of their own serve only as base classes and are skipped. The
+        classes are ordered by file, and by position within each file.
 
         Args:
             package: Dotted name of the package whose files are searched.
@@ -190,7 +190,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
     Returns:
         The words, separated by spaces, and the unit. The unit is empty if the name does not end
-        in one.
+        in a unit.
     """
     words = name.split("_")
     for word_count in range(1, len(words)):

@@ -50,7 +50,7 @@ class Extra(NamedTuple):
     def import_module(self, module: str) -> Any:
         """Imports a module of the group, which may not be installed.
 
-        If the package is missing, the user gets an error that contains the install command,
+        If the package is missing, the user gets an error message with the install command
         instead of a traceback.
 
         Args:
@@ -163,10 +163,10 @@ def open_regular(path: Path, **options: Any) -> Any:
 
 @contextmanager
 def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO]:
-    """Context manager that opens a file for reading, and converts errors.
+    """Context manager that opens a file for reading, and raises errors of a given class.
 
-    Errors of the operating system are converted to errors that a user can act on. Pipes and
-    devices are rejected, because reading them might never end.
+    Errors of the operating system are converted to errors of this class, whose messages users
+    can act on. Pipes and devices are rejected, because reading them might never end.
 
     Args:
         path: The file.
@@ -240,7 +240,7 @@ SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
 def refuse_link(path: Path) -> None:
     """Raises UsageError if an output path is a symbolic link.
 
-    Another user could have created the link, and the output would replace a file elsewhere.
+    Another user could have created the link so that the output replaces a file elsewhere.
 
     Args:
         path: The output path.
@@ -263,9 +263,9 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
     Args:
         folder: The folder. If None, the next free folder `runs/NAME-N` is used.
         name: NAME in this path.
-        force: True if the folder may contain files. If False, files cause an error that
-            suggests the option --force. If None, files also cause an error, but without this
-            suggestion, for commands that do not have the option.
+        force: True if the folder may contain files. If False, files in the folder cause an
+            error that suggests the option --force. None is for commands without this option:
+            files cause an error without the suggestion.
 
     Returns:
         Path of the folder.
@@ -482,7 +482,7 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
-    """Converts a system error raised while writing a file to an error with a remedy.
+    """Returns an error with a remedy for a system error that occurred while writing a file.
 
     A full disk and a wrong path require different remedies, so they are reported by different
     error classes. The caller raises the result.

@@ -26,11 +26,11 @@ _loaders: dict[str, Callable[[], Any]] = {}
 
 
 def register_hooks(package: str, functions: Mapping[str, str]) -> None:
-    """Registers functions of a higher-level package by name for use in lower-level packages.
+    """Registers functions of a higher-level package by name, for use in lower-level packages.
 
     A lower-level package, such as `log`, must not import a higher-level package, such as the
-    ROS package. Instead, it looks up the registered function with `find_hook`, and the module
-    is imported only at that time.
+    ROS package. Instead, it looks up the registered function with `find_hook`, which imports
+    the function's module only at that time.
 
     Args:
         package: Name of the package, `__name__` in its `__init__.py`.

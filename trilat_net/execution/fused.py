@@ -111,8 +111,8 @@ class FusedRun(CompiledRun):
     def check_scenario(scenario: Scenario, plants: Collection[str] = ()) -> None:
         """Raises ScenarioError if the compiled loop cannot execute a scenario.
 
-        The loop computes the motion of all arms itself. It cannot use a real robot, and a
-        user's program may move an arm only if the caller provides that program.
+        The loop cannot control a real robot. It computes the motion of each arm itself, unless
+        the caller provides a user's program that computes the motion of this arm.
 
         Args:
             scenario: The scenario.
@@ -137,10 +137,10 @@ class FusedRun(CompiledRun):
 
     @classmethod
     def simulate_log(cls, scenario: Scenario) -> Log:
-        """Simulates an experiment, and returns a log with the columns of its records.
+        """Simulates an experiment, and returns a log whose records are stored in columns.
 
-        The log contains the columns computed by the simulation: times, modes, motions, torques,
-        estimates, sent values, and the samples in use. They are bit-identical to those of
+        There is one column per computed quantity: times, modes, motions, torques, estimates,
+        sent values, and the samples in use. The columns are bit-identical to those of
         `SimulatedLog`, which executes each tick in Python and writes a message for it. A
         `SimulatedLog` is returned if these columns do not describe the run completely (see
         `_is_described_by_columns`), or if the run ends early.
@@ -183,8 +183,8 @@ class FusedRun(CompiledRun):
     def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
         """Explains why the compiled loop cannot repeat a run exactly from its log alone.
 
-        For example, the log may lack records, or a control law may be code that must not run
-        here.
+        For example, records may be missing from the log, or a control law may be code that is
+        not allowed to run on this machine.
 
         Args:
             log: Log of the run.
@@ -212,9 +212,9 @@ class FusedRun(CompiledRun):
 
     @staticmethod
     def read_inputs(log: Log) -> RunInputs:
-        """Reads everything that is needed to repeat a run from its log.
+        """Reads from a log everything that is needed to repeat its run.
 
-        The inputs are the ticks in which samples from other sites arrived, the changes of
+        The inputs are the ticks in which samples from other sites arrived, the changes to
         settings, and the actions of live operators (people or programs that moved an arm). The
         run must be repeatable, see `explain_not_repeatable`.
 
@@ -304,7 +304,7 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
 def _is_described_by_columns(scenario: Scenario) -> bool:
     """Returns True if the arrays computed by the simulation describe a run completely.
 
-    Some information exists only in a written log: changes of settings, the actions of live
+    Some information exists only in a written log: changes to settings, the actions of live
     operators, the motion of objects in an environment, and the modes of a site that reacts to
     missing samples.
 

@@ -39,7 +39,7 @@ _MAX_GAPS_NAMED = 60
 
 @dataclass(frozen=True, repr=False)
 class LogCheckReport(CheckReport):
-    """Findings of all checks of a log, which decide whether the log can be trusted.
+    """Findings of all checks of a log, which show whether the log can be trusted.
 
     The report passes if the log is unchanged since it was written, enough of its records have
     been compared, and every re-execution agrees with the log.
@@ -135,8 +135,8 @@ class LogCheckReport(CheckReport):
         """Checks one log, possibly in a worker process of a pool.
 
         The arguments and the result can be sent to another process, so many logs can be checked
-        in parallel. A user's control law that cannot be created yields a failed finding instead
-        of an error.
+        in parallel. If a user's control law cannot be created, no error is raised, but the
+        report contains a failed finding.
 
         Args:
             sources: Paths of the files that make up the log.
@@ -230,10 +230,10 @@ def _check_virtual_time(
 
     - "virtual time fed with the log's arrivals": each sample arrives when it did in the log.
       All records must be equal, up to the first gap in the log.
-    - "plain virtual time": each sample arrives at once. The records must be equal up to the
-      first sample that the real network lost or delivered too late. This simulation is omitted
-      if the run necessarily differs from it, for example because an arm was external. This is
-      not a fault of the log, so the finding passes.
+    - "plain virtual time": each sample arrives without delay. The records must be equal up to
+      the first sample that the real network lost or delivered too late. This simulation is
+      omitted if the run necessarily differs from it, for example because an arm was external.
+      This is not a fault of the log, so the finding passes.
 
     Args:
         log: The log.

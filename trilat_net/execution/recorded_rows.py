@@ -53,7 +53,8 @@ class SampleTable(NamedTuple):
             log: The log.
 
         Returns:
-            The samples, or None if a record of the log does not have the exact layout.
+            The samples. None if a record of the log does not have exactly the layout that this
+            program writes, or if the samples of the sites have different lengths.
         """
         bits = []
         last_tick = max(site_log.last_tick for site_log in log.values())
@@ -116,7 +117,7 @@ def _find_samples(
 class PlainRows:
     """Reads the records of one site in blocks whose ticks compiled code can re-execute.
 
-    Only plain records are read, meaning that all inputs of the tick are in the log.
+    Only plain records are read. A record is plain if all inputs of its tick are in the log.
 
     Args:
         site_log: Records of the site.
@@ -145,14 +146,14 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the boot in a record (the random number that identifies a process start)."""
+        """Returns the boot in a record, a number that identifies a start of the process."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:
         """Counts the records whose ticks compiled code can execute next in a single block.
 
-        The caller ensures that the first record comes from the current start of the site's
-        process and belongs to the next tick. A block has at most `BLOCK_ROWS` records.
+        The caller ensures that the first record belongs to the next tick, and was produced
+        since the current start of the site's process. A block has at most `BLOCK_ROWS` records.
 
         Args:
             row: Index of the first record.

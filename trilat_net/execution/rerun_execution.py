@@ -64,19 +64,19 @@ class _ChangedValue(NamedTuple):
 
 @dataclass(frozen=True)
 class RerunRequest:
-    """A checked request for a rerun: which sites of a log to run again, and how.
+    """A checked request for a rerun: the sites of a log to run again, and changed settings.
 
     Created by `RerunRequest.resolve`. All other sites keep the records of the log.
 
     Attributes:
         original: Scenario of the log.
-        scenario: Scenario of the rerun. It contains the changes for the sites to run again; the
-            recorded sites are the same as in the log.
+        scenario: Scenario of the rerun. It contains the changed settings of the sites to run
+            again, and the original settings of all other sites.
         replaced: Names of the sites to run again, in scenario order.
         recorded: Names of the other sites, in scenario order.
-        changes: Changed values.
-        without_effect: Requested changes that affect only recorded sites, and therefore have no
-            effect.
+        changes: Changed settings, with their values in the log and in the rerun.
+        without_effect: Requested changes that have no effect, because they concern only sites
+            that are not run again.
     """
 
     original: Scenario
@@ -90,8 +90,8 @@ class RerunRequest:
     def mode(self) -> str:
         """Kind of the rerun: "closed loop" if every site is run again, otherwise "open loop".
 
-        In an open loop, the sites that are not run again keep their records, and therefore do
-        not react to changes.
+        In an open-loop rerun, the sites that are not run again keep their records, and
+        therefore do not react to changes.
         """
         return "open loop" if self.recorded else "closed loop"
 
@@ -123,19 +123,19 @@ class RerunRequest:
     ) -> "RerunRequest":
         """Checks a request for a rerun, and applies its changes to the scenario of the log.
 
-        A rerun runs sites of a log again, usually with changed settings. In a closed loop, all
-        sites are run again. Otherwise, some sites keep their records.
+        A rerun runs sites of a log again, usually with changed settings. In a closed-loop
+        rerun, all sites are run again. Otherwise, some sites keep their records.
 
         Args:
             log: Log of a run, which contains its scenario.
-            replace: Names of the sites to run again. Empty for a closed loop.
+            replace: Names of the sites to run again. Empty for a closed-loop rerun.
             overrides: Changed settings, in the form accepted by `load_scenario`.
             closed_loop: If True, all sites are run again.
 
         Raises:
             UsageError: Both `replace` and `closed_loop` are given, or neither is.
-            ScenarioError: There is no such site, or a change is invalid or cannot have an
-                effect.
+            ScenarioError: A site to run again does not exist, or a change is invalid or cannot
+                have an effect.
         """
         original = log.scenario
         names = original.names
@@ -501,9 +501,9 @@ class _RerunSite:
           two records before the tick: the state is restored, and the tick is executed.
         - The state remains uncertain: the record of the tick is copied from the log.
 
-        Afterwards, `k` is the next tick. A gap contains no records to copy or compare, so its
-        ticks are executed only if settings were changed, in which case their results are new.
-        Otherwise the gap is skipped.
+        Afterwards, `k` is the next tick. A gap in the log contains no records to copy or
+        compare. If settings were changed, the ticks of the gap are executed, because they then
+        have new results. Otherwise, the gap is skipped.
 
         Returns:
             The tick with its record.
@@ -635,7 +635,7 @@ No sample is in transit for longer.
 
 
 class RerunExecution:
-    """Runs all requested sites of a log again, together.
+    """Runs all requested sites of a log again, in one common simulation.
 
     These sites exchange newly computed samples. The samples of the other sites are taken from
     the log.
@@ -645,7 +645,7 @@ class RerunExecution:
         request: Sites to run again, and changed settings.
 
     Attributes:
-        sites: Mapping from the name of each site that is run again to the site.
+        sites: Sites that are run again, keyed by name.
 
     Raises:
         LogError: The log does not contain enough data to run the sites again.
@@ -718,8 +718,8 @@ class RerunExecution:
         """Executes all ticks of the requested sites, and yields the result of each tick.
 
         Ticks are executed in order of time, except that a site waits until the samples that it
-        receives exist. A site stops when its arm leaves its limits. If settings were changed,
-        all sites stop at this time.
+        receives have been computed. A site stops when its arm leaves its limits. If settings
+        were changed, all sites stop at this time.
 
         Args:
             progress: Function that is called from time to time with the number of executed

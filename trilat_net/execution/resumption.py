@@ -40,9 +40,9 @@ ReceivedMotion = State | Arrival
 def make_arrival(
     peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0
 ) -> Arrival:
-    """Returns the message with which a sample from another site arrives at a receiver.
+    """Returns the message that delivers a sample from another site to a receiver.
 
-    The message contains all values that the sender's control law sends, for all receivers. Use
+    The message contains all values that the sender's control law sends to any receiver. Use
     `select_peer_channels` to select the values for one receiver.
 
     Args:
@@ -73,13 +73,13 @@ def make_arrival(
 def select_peer_channels(
     arrivals: Sequence[Arrival], links: Sequence[LinkSetup]
 ) -> list[Arrival]:
-    """Returns copies of arrivals that contain only the values intended for one receiver.
+    """Returns copies of arrived samples that contain only the values for one receiver.
 
     A control law may send different values to different receivers. The values for other
     receivers are removed.
 
     Args:
-        arrivals: Arrivals with the values for all receivers.
+        arrivals: Arrived samples with the values for all receivers.
         links: Links of the receiver, in the order of its peers.
     """
     selected = []
@@ -96,8 +96,8 @@ def select_peer_channels(
 def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
     """Returns how an operator moved a site's arm in one tick, according to the log.
 
-    The site that is run again may have a different tick rate, so the newest record up to the
-    time of the tick is used.
+    The site that is run again may have a different tick rate than in the log, so the newest
+    record up to the time of the tick is used.
 
     Args:
         site_log: Records of the site in the log.
@@ -119,7 +119,7 @@ def find_recorded_hand(site_log: SiteLog, site: Site, k: int) -> list[float]:
 
 
 class RecordedInputs(Generic[Change]):
-    """All inputs of one site according to a log: received samples and changes of settings.
+    """All inputs of one site according to a log: received samples and changes to settings.
 
     With these inputs, the site can be run again.
 
@@ -150,7 +150,7 @@ class RecordedInputs(Generic[Change]):
         links: Sequence[LinkSetup],
         states: Sequence[State] | None = None,
     ) -> None:
-        """Collects what a site received in a recorded run: samples and changes of settings."""
+        """Collects what a site received in a recorded run: samples and changes to settings."""
         self._site_log = site_log
         self._states = site_log.states if states is None else states
         self._links = links
@@ -162,14 +162,14 @@ class RecordedInputs(Generic[Change]):
 
     @property
     def next_change_tick(self) -> int | None:
-        """Tick at which the next change of the settings takes effect.
+        """Tick at which the next change to a setting takes effect.
 
         None if the recorded run has no further changes.
         """
         return self._changes[-1][0] if self._changes else None
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Removes and returns the changes of settings that take effect no later than a tick.
+        """Removes and returns the changes to settings that take effect no later than a tick.
 
         Args:
             tick: Last tick whose changes are returned.
@@ -212,7 +212,7 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels(arrivals, self._links), unknown_entries
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
-        """Stores which samples arrived although the log does not contain their content.
+        """Stores which samples arrived although their content is missing from the log.
 
         The content is unknown if the sender's record is missing. A tick that uses such a sample
         cannot be computed with certainty.
@@ -268,7 +268,7 @@ class RecordedInputs(Generic[Change]):
         Args:
             site: The site that is run again; its state is replaced.
             row: Index of the record of the next tick, among the records of the site.
-            changes: Changes of settings since the last executed tick of the site.
+            changes: Changes to settings since the last executed tick of the site.
         """
         states = self._states
         peers = self._site_log.peers

@@ -101,8 +101,8 @@ class RecordDifference(NamedTuple):
     def of_law_failure(cls, failure: LawFailed) -> "RecordDifference":
         """Describes the failure of a user's control law in a re-executed tick of a log.
 
-        The law did not fail in the logged session. No further ticks of the site that uses the
-        law can be executed, and the report counts the failure as a logged record that the
+        The law did not fail in the logged session. After the failure, no further ticks of the
+        site can be executed. The report counts the failure as a logged record that the
         re-execution did not reproduce.
 
         Args:
@@ -259,7 +259,7 @@ class VerifyResult:
         whole_run: True if whole runs were executed and compared bit by bit. False if single
             ticks were executed and compared within a tolerance.
         coverage: For each site, the number of judged ticks and the number of ticks of the run.
-        min_coverage: Smallest fraction of the ticks of every site that must be judged.
+        min_coverage: Smallest fraction of every site's ticks that must be compared.
         integrity: States whether the log is unchanged since it was written.
         records: Number of records that were examined.
         identical: Number of records in which every computed field agrees with the re-execution.
@@ -433,11 +433,11 @@ class _SiteVerifier:
         )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
-        """Re-executes every recorded tick of a site, and compares the results with the log.
+        """Re-executes every recorded tick of the site, and compares the results with the log.
 
-        The ticks of long sequences of plain records are executed by a compiled loop, and all
-        other ticks one by one. The counts of identical, differing and missing records are added
-        to the `VerifyResult` of this object.
+        Long sequences of ticks whose inputs are all in the log are executed by a compiled loop,
+        and all other ticks one by one. The counts of identical, differing and missing records
+        are added to the `VerifyResult` of this object.
 
         Args:
             report: Function that is called from time to time with the number of examined
@@ -846,10 +846,10 @@ def verify_log(
         log: Log of a run or rerun.
         progress: Function that is called from time to time with the number of examined records
             and their total.
-        min_coverage: Smallest fraction of the ticks of every site that must be judged.
+        min_coverage: Smallest fraction of every site's ticks that must be compared.
         resume_every: In every tick that is divisible by this number, the site is replaced by a
-            new site restored from the records. This reveals state that a law keeps outside its
-            `memory`. 0 means never.
+            new site restored from the records. This reveals whether a law keeps any state
+            outside its `memory`. 0 means never.
 
     Raises:
         LogError: A record cannot be read.

@@ -167,7 +167,7 @@ class SiteChannels:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the event that marks the end of a site's run in the log.
+        """Returns the log entry of the event that marks the end of the site's run.
 
         Args:
             t_ns: Time of the event, in ns after the epoch (the common start time). By default,
@@ -181,7 +181,7 @@ class SiteChannels:
         """Creates an event of the site, with the next event number, as an entry for the log.
 
         Args:
-            kind: Kind of the event, for programs.
+            kind: Kind of the event, in a form that programs can evaluate.
             text: Description of the event in one sentence, for people.
             t_ns: Time of the event, in ns after the epoch.
         """
@@ -260,11 +260,11 @@ class SiteChannels:
         )
 
     def make_event_entry(self, event: Event, number: int) -> SiteEntry:
-        """Converts an event that a site published in an earlier run to an entry for the log.
+        """Converts an event that the site published in an earlier run to an entry for the log.
 
         Args:
             event: The event, such as a change of the site's mode.
-            number: Number of the event, used only if the event itself has none.
+            number: Number of the event, used only if the event itself has no number.
         """
         has_number = event.n >= 0  # events of the oldest versions have no number
         numbered = event if has_number else msgspec.structs.replace(event, n=number)
@@ -371,7 +371,7 @@ def execute_virtual(
     In virtual time, the sites run in one process, as fast as possible. Ticks are executed in
     order of their nominal time; simultaneous ticks are executed in scenario order of their
     sites. A site is held back until the samples that it needs have been sent. If the arm of a
-    site leaves its limits, the run ends with the ticks of that time.
+    site leaves its limits, the run ends after all ticks at that time.
 
     Args:
         scenario: The scenario, with its sites and links.
@@ -379,7 +379,7 @@ def execute_virtual(
             after its time stamp.
         commands: Changes that take effect during the run.
         measured: Measured states of external arms.
-        ends: Last tick of each site that executes fewer ticks than the scenario has.
+        ends: Last tick of each site that stops before the end of the scenario.
         hands: Actions of live operators. A live operator without an entry does not hold the
             arm.
         plants: Users' programs that move the arms of sites.
@@ -387,7 +387,7 @@ def execute_virtual(
     Raises:
         ScenarioError: An arm is external but appears in neither `measured` nor `plants`.
         LawFailed: A user's control law failed.
-        PlantFailed: A user's plant failed.
+        PlantFailed: A user's program that moves an arm failed.
     """
     scenario.refuse_external_arms({**measured, **plants})
     if network is None:
@@ -471,7 +471,7 @@ class _VirtualChannels(SiteChannels):
         """Writes the record of a tick to the log, followed by its statistics and events.
 
         Args:
-            arrivals: Samples from other sites that arrived for this tick.
+            arrivals: Samples from other sites that arrived in this tick.
             output: Results of the tick.
         """
         payload = encode_state(
@@ -495,10 +495,10 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes the reports about an operator's connection to the log, and empties the list.
+        """Writes events to the log that report on an operator's connection.
 
         Args:
-            news: The reports, as pairs of tick number and sentence.
+            news: The reports, as pairs of tick number and sentence; emptied afterwards.
         """
         for k, text in news:
             t_ns = k * NS_PER_S // self._rate_hz

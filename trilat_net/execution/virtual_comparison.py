@@ -9,7 +9,7 @@ the network was too slow.
 Invariant (L2):
     - A simulation in which all samples arrive when they arrived in the log agrees with the log
       in every tick.
-    - A simulation in which all samples arrive at once agrees with the log up to the first
+    - A simulation in which all samples arrive without delay agrees with the log up to the first
       sample that was late or lost in the network.
 """
 
@@ -45,12 +45,12 @@ class _RecordComparison(NamedTuple):
     first: RecordDifference | None
 
     def to_finding(self, label: str, excused_from: int | None) -> Finding:
-        """Returns the finding on whether a log agrees with another execution of its run.
+        """Returns a finding that states whether a log agrees with another execution of its run.
 
         Args:
             label: Name of the check.
-            excused_from: Tick from which differences are expected and do not fail the check.
-                None if there is no such tick.
+            excused_from: Tick from which differences are expected. They do not cause the check
+                to fail. None if no differences are expected.
         """
         first = self.first
         text = f"{self.identical}/{count_nouns(self.records, 'record')} identical"
@@ -238,10 +238,10 @@ class _VirtualComparison(NamedTuple):
     Attributes:
         fed: Comparison with a simulation in which each sample arrives when it arrived in the
             session. All records must be equal.
-        plain: Comparison with a simulation of a perfect network, in which samples arrive at
-            once. The records must be equal up to the first late or lost sample. If an arm is
-            external, no records are compared, because its motion is known only for the recorded
-            run.
+        plain: Comparison with a simulation of a perfect network, in which samples arrive
+            without delay. The records must be equal up to the first late or lost sample. If an
+            arm is external, no records are compared, because its motion is known only for the
+            recorded run.
         absent: Samples that arrived too late or never, in order of the tick in which they were
             due.
     """
@@ -273,8 +273,8 @@ class _VirtualComparison(NamedTuple):
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> _VirtualComparison:
     """Compares a log with two simulations of its scenario in virtual time.
 
-    In the first simulation, samples arrive as in the log. In the second, they arrive at once.
-    Both end at the last record of the log.
+    In the first simulation, samples arrive as in the log. In the second simulation, they arrive
+    without delay. Both simulations end at the last record of the log.
 
     Args:
         log: Log of a live session, which contains its scenario.
@@ -304,7 +304,8 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
             taken from the log. A tick is executed when the caller requests its record.
 
             Args:
-                network: Network that delivers the samples. If None, samples arrive at once.
+                network: Network that delivers the samples. If None, samples arrive without
+                    delay.
                 ticks_before: Number of ticks of earlier simulations, for reporting progress.
 
             Yields:
@@ -333,7 +334,7 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> _Virtual
 
 
 def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns a mapping from tick to the samples that arrived at a site for that tick.
+    """Returns a mapping from tick to the samples that arrived at a site in that tick.
 
     Arrivals in gaps in the log are estimated, unless too many records are missing.
     """

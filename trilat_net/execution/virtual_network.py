@@ -32,7 +32,7 @@ from .resumption import ArrivalEntry, make_arrival
 class Network(Protocol):
     """Interface of a network between the sites of a simulation in virtual time.
 
-    A network decides in which tick of the receiver a sample arrives. The simulation calls
+    A network determines in which tick of the receiver a sample arrives. The simulation calls
     `send` after each tick of a site, and `deliver` before each tick.
     """
 
@@ -135,8 +135,8 @@ class RecordedNetwork:
     def is_ready(self, receiver: str, k: int) -> bool:
         """Returns True if all samples that the log lists for a receiver's tick have been sent.
 
-        In a live session, a site whose loop ran late may have received samples with later times
-        than that of its own tick. The senders of such samples must run first. Meanwhile, this
+        In a live session, a site whose loop ran late may have received samples with later time
+        stamps than its own tick. The senders of these samples must run first. Meanwhile, this
         method is called repeatedly. Each call continues with the first sample that had not been
         sent at the end of the previous call.
 
@@ -159,9 +159,9 @@ class RecordedNetwork:
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
         """Returns the samples that arrive in tick `k` of a receiver according to the log.
 
-        A sample that its sender has not produced does not arrive. After a gap in the log, more
-        samples may be assumed to arrive than a tick accepts (`MAX_ARRIVALS`), in which case
-        only the newest ones are returned.
+        Samples that the sender has not produced do not arrive. After a gap in the log, more
+        samples may be assumed to arrive than a tick accepts (`MAX_ARRIVALS`). In this case,
+        only the newest samples are returned.
         """
         peers = self._peers[receiver]
         arrivals = []
@@ -176,7 +176,7 @@ class Deliveries(NamedTuple):
     """Samples that one site received from other sites according to a log.
 
     Attributes:
-        entries: For each tick, the samples that arrived for it, in order of arrival.
+        entries: Samples that arrived in each tick, in order of arrival, keyed by tick.
         unrecorded: Ticks between `first` and `last` whose record is missing from the log. Their
             entries are estimated.
         first: First tick with a record.
@@ -190,7 +190,7 @@ class Deliveries(NamedTuple):
 
     @classmethod
     def read(cls, site_log: SiteLog) -> "Deliveries":
-        """Reads the samples that arrived in each tick from a site's records.
+        """Reads from a site's records which samples arrived in each tick.
 
         Ticks without a record are left out; use `Deliveries.complete` to fill them in.
 
@@ -223,12 +223,12 @@ class Deliveries(NamedTuple):
     ) -> "Deliveries":
         """Returns the arrivals at a site for every tick from its first to its last record.
 
-        If the record of a tick is missing, the log does not show which samples arrived in it. A
-        sample that no record lists is assumed to have arrived in such a tick, if one is
-        possible. A tick is possible if it is after the sample was sent, after the arrival of
-        the last earlier sample that a record lists, and before the arrival of the first later
-        sample. If several ticks are possible, the one whose delay is closest to the median
-        delay of the link is chosen.
+        If the record of a tick is missing, the log does not show which samples arrived in this
+        tick. A sample that no record lists is assumed to have arrived in a tick without a
+        record. This tick must be after the sample was sent, after the arrival of the last
+        earlier sample that a record lists, and before the arrival of the first later sample. If
+        several ticks meet these conditions, the tick whose delay is closest to the median delay
+        of the link is chosen. If no tick does, the sample does not arrive.
 
         Args:
             site_log: Records of the site, each of which lists the samples that arrived in its
@@ -281,10 +281,10 @@ class Deliveries(NamedTuple):
     ) -> "Deliveries":
         """Converts the arrivals of a log to arrivals for sites with different tick rates.
 
-        The network is assumed to be the same. Each sample of the new run corresponds to the
-        last sample of the log that was not sent later. The new sample takes as long from its
-        time stamp to the tick of its arrival as this recorded sample did. If the recorded
-        sample never arrived, neither does the new sample.
+        The network is assumed to be the same. Each sample of the new run is matched with the
+        last sample of the log that was sent at the same time or earlier. The new sample takes
+        as long from its time stamp to the tick of its arrival as the recorded sample did. If
+        the recorded sample never arrived, neither does the new sample.
 
         Args:
             rate_hz: Tick rate of the site in the log, in Hz.

@@ -132,7 +132,7 @@ class _LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True if the delays on a network link differ between the recorded and the new run.
+        """True if the delays on the network link differ between the recorded run and the rerun.
 
         The delay is measured as the age of the received data when they are used. The mean and
         the maximum are compared.
@@ -161,7 +161,7 @@ class _CommonRecords(NamedTuple):
     def compare(self, figure: Callable[[Array], float], field: str) -> LogAndRerun:
         """Computes the same quantity from the records of the log and of the rerun.
 
-        Only ticks that have a record in both are used.
+        Only ticks that have a record in both the log and the rerun are used.
 
         Args:
             figure: Function that computes the quantity from an array of shape (K, n), for K
@@ -317,9 +317,9 @@ class Rerun(Result):
         before: The log whose sites were run again.
         request: Sites that were run again, and changed settings.
         ticks: Every tick of these sites, in order of execution.
-        sites: Mapping from the name of each of these sites to the effect on it.
-        links: Mapping from the name of each link that ends at one of these sites to the effect
-            on it.
+        sites: Effect of the rerun on each of these sites, keyed by the name of the site.
+        links: Effect of the rerun on each link that ends at one of these sites, keyed by the
+            name of the link.
     """
 
     before: Log
@@ -352,10 +352,11 @@ class Rerun(Result):
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
         """Writes the rerun to a stream as a log.
 
-        The log can be read, displayed and checked like that of a run. The new records contain
-        no measured values, such as computing times and round trips. The records of sites that
-        were not run again are copied byte for byte. The file states the SHA-256 hash of its
-        source log, the sites run again and the changes. Its scenario is that of the rerun.
+        The log can be read, displayed and checked like the log of a run. The new records
+        contain no measured values, such as computing times and round-trip times. The records of
+        sites that were not run again are copied byte for byte. The file states the SHA-256 hash
+        of its source log, the sites run again and the changed settings. Its scenario is that of
+        the rerun.
 
         Args:
             stream: Stream to which the log is written. It is not closed.
@@ -442,10 +443,10 @@ class Rerun(Result):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences for the user about the limitations of the rerun.
+        """Sentences that tell the user about the limitations of the rerun.
 
         For example, records may have been copied because the log was incomplete. Empty if there
-        is nothing to mention.
+        are no limitations.
         """
         return list(_describe_limits(self))
 
@@ -501,7 +502,8 @@ def rerun(
     Raises:
         LogError: The log cannot be read, or lacks data that is needed to run the sites again.
         UsageError: Both `replace` and `closed_loop` are given, or neither is.
-        ScenarioError: There is no such site, or a change is invalid or cannot have an effect.
+        ScenarioError: A site to run again does not exist, or a change is invalid or cannot have
+            an effect.
         CodeWithheld: The control law of a site to run again is code that is not allowed to run.
     """
     before = log if isinstance(log, Log) else open_log(log)

@@ -249,11 +249,11 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the torque blends from the rest torque to the torque of the law.
+    """Returns True while the torque changes gradually from the rest torque to the law's torque.
 
-    The blend starts when a resting arm begins to move towards the other arms, and takes
-    `RETURN_NS`. An arm that realigns with the others because one of them was lost or came back
-    was not at rest, and needs no blend.
+    This change starts when a resting arm begins to move towards the other arms, and takes
+    `RETURN_NS`. It does not take place if an arm realigns with the others because one of them
+    was lost or came back, since the arm was not at rest.
 
     Args:
         t_ns: Time, ns since the start of the session.
@@ -268,7 +268,7 @@ def is_law_returning(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
-    """Enters FAULT or STOPPED, which only a command can end.
+    """Enters the mode FAULT or STOPPED, which only an order can end, see `LifeOrder`.
 
     The arm comes to rest and is then held against gravity. Parameter estimates that are not
     finite are reset to zero, because the gravity torque is computed from them and must be
@@ -410,13 +410,13 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Updates the mode of an arm (such as waiting, following or resting) and its reference.
 
-    The mode changes on a command of a person or of the site itself, on a fault of the arm, or
-    when peers fall silent or are heard again.
+    The mode changes on a command from a person or from the site itself, on a fault of the arm,
+    or when peers fall silent or are heard again.
 
     Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms' positions
-    and its derivative. After the call, they contain the reference: this mean in RUN, the mean
-    plus an offset in RETURN, and the rest reference in all other modes. The reference of the
-    previous tick is in `q_followed` and `qd_followed`.
+    and the derivative of this mean. After the call, they contain the reference: this mean in
+    RUN, the mean plus an offset in RETURN, and the rest reference in all other modes. The
+    reference of the previous tick is in `q_followed` and `qd_followed`.
 
     Args:
         t_ns: Time, ns since the start of the session.

@@ -23,8 +23,8 @@ from .live_hand import GLIDE_NS, GRIP_NS, SILENCE_NS, HandRules, find_glide_ns, 
 AXES = 2
 """Number of coordinates of an action."""
 ACTION_NUMBERS = 1 + 2 * AXES
-"""Number of values of an action in one tick: the grip, the target, and the target one second
-later.
+"""Number of values of an action in one tick: the grip, the target, and the target extrapolated
+by one second.
 """
 
 
@@ -125,8 +125,8 @@ def _advance_hands(
 
     Args:
         runs: Number of runs.
-        first: First tick of each run, shape (L,).
-        count: Number of ticks.
+        first: First tick to compute in each run, shape (L,).
+        count: Number of ticks to compute.
         rate_hz: Tick rate of the sites, Hz.
         period_ticks: Time between decisions, ticks.
         is_idle: 1 for runs that are not advanced, shape (L,).
@@ -136,8 +136,8 @@ def _advance_hands(
         poses: Pose of the arm at the first tick, m or rad, shape (L, 2).
         hands: State of the hands in all runs; modified.
         rows: Buffer for the actions of one run, shape (ticks, 3 + 2 * 2).
-        actions: Receives the grip, the target, and the target one second later for each tick
-            and lane, shape (ticks, 5, L).
+        actions: Receives the grip, the target, and the target extrapolated by one second, for
+            each tick and lane, shape (ticks, 5, L).
     """
     grip_step = 1e9 / (GRIP_NS * rate_hz)
     for lane in range(runs):
@@ -199,8 +199,8 @@ class SeveralHands:
 
     Attributes:
         arrays: State and limits of the hands.
-        actions: Grip, target, and target one second later, for each tick of the latest call of
-            `advance` and each run, shape (ticks, 5, L).
+        actions: Grip, target, and the target extrapolated by one second, for each tick of the
+            latest call to `advance` and each run, shape (ticks, 5, L).
     """
 
     axes = AXES
@@ -259,7 +259,7 @@ class SeveralHands:
     def begin(self, run: int, rules: HandRules) -> None:
         """Resets one simulation to a state in which the program does not yet hold its arm.
 
-        Must be called for each simulation before its first tick.
+        This method must be called for each simulation before its first tick.
 
         Args:
             run: Index of the run.
@@ -297,8 +297,8 @@ class SeveralHands:
 
         Args:
             runs: Number of runs to advance. Their values are the first entries of each array.
-            first: First tick of each run, shape (L,).
-            count: Number of ticks.
+            first: First tick to compute in each run, shape (L,).
+            count: Number of ticks to compute.
             is_idle: 1 for runs that are not advanced, shape (L,).
             acts: 1 for runs in which a decision takes effect at the first tick, shape (L,).
             goals: The decisions that take effect, shape (L, 2).

@@ -66,14 +66,14 @@ def advance_losses(u: float, v: float, fresh: bool, link: LinkRow, model: Row) -
     """Decides at random whether the next sample is lost, on a link with bursty losses.
 
     The link is in a good or a bad state, each with its own loss probability (Gilbert-Elliott
-    model). From one sample to the next, it enters the bad state with probability `enter`, and
-    leaves it with probability `leave`. For the first sample, the state is drawn from the
-    stationary distribution, in which the bad state has probability enter / (enter + leave).
+    model). From one sample to the next, a good link turns bad with probability `enter`, and a
+    bad link turns good with probability `leave`. For the first sample, the state is drawn from
+    the stationary distribution, in which the bad state has probability enter / (enter + leave).
 
     Args:
         u: Uniform random number that determines the state of the link.
-        v: Uniform random number that determines the loss.
-        fresh: True for the first sample of the model.
+        v: Uniform random number that determines whether the sample is lost.
+        fresh: True for the first sample to which the model applies.
         link: State of the link; updated in place.
         model: Model in force, for which `loses_samples` is True.
     """
@@ -97,7 +97,7 @@ def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
 
     Args:
         sample: Index of the sample.
-        fresh: True for the first sample of the model.
+        fresh: True for the first sample to which the model applies.
         link: State of the link; updated in place.
         model: Model in force.
     """
@@ -112,13 +112,13 @@ def delay_sample(stamp_ns: int, delay_us: int, link: LinkRow, model: Row) -> int
     """Returns when a message that is not lost is delivered, ns since the start of the session.
 
     The delivery time is the sending time plus the delay. It may be postponed by a minimum delay
-    (play-out buffer).
+    (play-out buffer), and by an older message if messages must arrive in order.
 
     Args:
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
         delay_us: Delay of the sample, us. If the sample was duplicated, the smaller of the two
             delays.
-        link: State of the link. `due_before`, the latest delivery so far, is updated.
+        link: State of the link. `due_before`, the latest delivery time so far, is updated.
         model: Delay and loss model in force.
     """
     # The receiver's play-out buffer holds each sample for at least `playout_us`.
@@ -140,10 +140,10 @@ def find_due_ns(
     model: Row,
     points: Points,
 ) -> int:
-    """Computes when a network link delivers a message, after its loss and delay were drawn.
+    """Computes when a network link delivers a message whose loss and delay have been drawn.
 
-    Outages, duplicates and message ordering are taken into account here. Must be called exactly
-    once per sample, in order of increasing index.
+    Outages, duplicates and message ordering are taken into account here. This function must be
+    called exactly once per sample, in order of increasing index.
 
     Args:
         sample: Index of the sample.
@@ -186,15 +186,16 @@ def _due_ns(
 ) -> int:
     """Computes when a network link delivers a message, or whether the message is lost.
 
-    Must be called exactly once per sample, in order, because loss bursts and correlated delays
-    depend on the previous message. For the same reason, loss and delay are drawn even for a
-    message that is lost for another reason.
+    This function must be called exactly once per sample, in order, because loss bursts and
+    correlated delays depend on the previous message. For the same reason, loss and delay are
+    drawn even for a message that is lost for another reason.
 
     Args:
         sample: Index of the sample, which is the tick in which it was sent.
         stamp_ns: Time at which the sample was sent, ns since the epoch (the common start of the
             session).
-        fresh: True for the first sample of the model, which initialises the model's state.
+        fresh: True for the first sample to which the model applies, which initialises the
+            model's state.
         link: State of the link; updated in place, see `find_due_ns`.
         model: Delay and loss model in force, a row of LINK_MODEL_DTYPE.
         points: Delay traces and outages of all links of the receiver.
@@ -222,7 +223,7 @@ def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) ->
     """Selects the delay and loss model for a message according to when it was sent.
 
     A scenario may change the model at planned times, for example to a slower network after 5 s.
-    Messages sent before then keep the earlier model.
+    Messages sent before that time keep the earlier model.
 
     Args:
         sample: Index of the sample.
@@ -231,7 +232,7 @@ def select_model(sample: int, stamp_ns: int, link: LinkRow, models: RowArray) ->
         models: Models of the link, in the order in which they take effect.
 
     Returns:
-        True if the sample is the first one of the model.
+        True if the sample is the first one to which the selected model applies.
     """
     fresh = sample == 0
     # Advance while a later model took effect before the sample was sent.

@@ -159,7 +159,7 @@ class LinkModel(NamedTuple):
 
     @classmethod
     def gamma(cls, shape: float, scale_us: float) -> "LinkModel":
-        """Creates a model with gamma-distributed delays, with the scale in us."""
+        """Creates a model with gamma-distributed delays; the scale is given in us."""
         return cls(kind=DelayKind.GAMMA, extra=shape, scale=scale_us)
 
     @classmethod
@@ -178,11 +178,13 @@ class LinkModel(NamedTuple):
     ) -> "LinkModel":
         """Creates a model whose delays are the sum of a fixed and an exponential part.
 
+        The exponential part has one of two means, chosen at random for each message.
+
         Args:
             floor_us: Fixed part, us.
-            fast_us: Mean of the frequent exponential part, us.
-            slow_us: Mean of the rare exponential part, us.
-            slow_share: Probability of the rare part.
+            fast_us: Mean of the exponential part of a fast message, us.
+            slow_us: Mean of the exponential part of a slow message, us.
+            slow_share: Probability that a message is slow.
         """
         return cls(
             kind=DelayKind.HYPER_EXPONENTIAL,
@@ -219,7 +221,7 @@ class LinkModel(NamedTuple):
 
     @classmethod
     def custom(cls, longest_us: float) -> "LinkModel":
-        """Creates a model whose delays come from a compiled function, see `draw_with`.
+        """Creates a model whose delays are computed by a compiled function, see `draw_with`.
 
         Args:
             longest_us: Longest delay, us.
@@ -227,7 +229,7 @@ class LinkModel(NamedTuple):
         return cls(kind=DelayKind.CUSTOM, location=longest_us)
 
     def draw_with(self, model: Any) -> "LinkModel":
-        """Returns this model with delays computed by the method `draw` of a class.
+        """Returns a copy of this model with delays computed by the method `draw` of a class.
 
         The method is compiled.
 
@@ -263,7 +265,7 @@ class LinkModel(NamedTuple):
 
     @property
     def is_random(self) -> bool:
-        """True if delays are drawn at random. Losses and duplicates do not count."""
+        """True if delays are drawn at random. Random losses and duplicates do not count."""
         return self.kind not in _DETERMINISTIC_KINDS
 
     @property
@@ -275,8 +277,8 @@ class LinkModel(NamedTuple):
     def least_us(self) -> float:
         """Shortest time for which a sample is held back, us.
 
-        A random delay may be as short as 0, but the play-out buffer holds each sample until it
-        has at least a given age.
+        A random delay may be as short as 0, but the play-out buffer holds each sample until the
+        sample has reached a given age.
         """
         is_constant = self.kind == DelayKind.CONSTANT
         return max(self.playout_us, self.location if is_constant else 0.0)
@@ -353,8 +355,8 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
     """Returns an upper bound on the delay of any message on a link, us.
 
-    It determines how much memory the receiver reserves for waiting messages. The bound includes
-    the play-out buffer, a minimum delay that the receiver adds to reduce jitter.
+    The bound determines how much memory the receiver reserves for waiting messages. It includes
+    the play-out buffer, a minimum delay that the receiver enforces to reduce jitter.
 
     Args:
         models: Delay models that apply to the link, one after another.
@@ -392,7 +394,7 @@ _LOOP = int(_TraceEnd.LOOP)
 
 @leaf
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
-    """Draws a random delay that does not depend on earlier delays, in us and not rounded.
+    """Draws a random delay, in us, that does not depend on earlier delays and is not rounded.
 
     The random numbers are a function of key, sample and purpose, so the same arguments always
     give the same delay. `DelayKind` defines the model parameters `location`, `scale`, `extra`
@@ -486,9 +488,9 @@ def _sine_delay_us(stamp_ns: int, model: Row) -> float:
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     """Returns the delay of a sample on a link that follows a recorded delay trace.
 
-    The delay is read from the last point of the trace at or before the sending time. A trace
-    that loops starts again after its last point, which applies for as long as the point before
-    it.
+    The delay is read from the last point of the trace at or before the sending time. If the
+    trace loops, its last point applies for as long as the point before it, and the trace then
+    starts again.
 
     Args:
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
@@ -520,7 +522,8 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
     Args:
         now: The argument passed to the user's function, which contains the seed of the link.
         index: Index of the draw, usually the index of the sample whose delay is computed.
-        attempt: Attempt for this index, starting at 0, for methods that reject some draws.
+        attempt: Number of the attempt for this index, starting at 0, for methods that reject
+            some draws.
     """
     return uniforms(np.uint64(now.key), index, DELAY, attempt)
 
@@ -590,7 +593,8 @@ def find_delay_us(
     Args:
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        fresh: True for the first sample of the model, which initialises the model's state.
+        fresh: True for the first sample to which the model applies, which initialises the
+            model's state.
         link: State of the link, including the seed of its random numbers.
         model: Delay model in force, a row of LINK_MODEL_DTYPE.
         points: Delay traces and outages of all links of the receiver.

@@ -86,7 +86,7 @@ class DominanceMatrix:
 
     @cached_property
     def closed_groups(self) -> tuple[tuple[int, ...], ...]:
-        """Groups of sites that follow each other, but no site outside their group.
+        """Groups of sites that follow each other, but follow no site outside their group.
 
         Each group is a tuple of the indices of its sites. If there are several groups, the
         weights of the sites in the energy function V are not unique.
@@ -106,7 +106,7 @@ class DominanceMatrix:
     def find_balancing_weights(self) -> Array | None:
         """Returns weights D > 0 with D_i alpha_ij = D_j alpha_ji, if the matrix is reversible.
 
-        With such weights, the matrix is similar to a symmetric one, so its eigenvalues are
+        With such weights, the matrix is similar to a symmetric matrix, so its eigenvalues are
         real. Some stability conditions hold only in this case. The equation is called detailed
         balance. It has a solution if the products of the dominance factors around each cycle of
         sites are equal in both directions (Kolmogorov's criterion), for example alpha12 alpha23
@@ -142,9 +142,10 @@ class DominanceMatrix:
     def find_least_eigenvalue(self) -> float | None:
         """Returns the least eigenvalue of the matrix, or None if the matrix is not reversible.
 
-        All eigenvalues of a reversible matrix are real, see `find_balancing_weights`. The
-        negative of the least eigenvalue is a lower bound on d / (K T), where d is the damping,
-        K the stiffness and T the delay (docs/theory/damping-conditions.md).
+        All eigenvalues of a reversible matrix are real, see `find_balancing_weights`. A
+        stability condition for spring laws requires that d / (K T) exceed the negative of the
+        least eigenvalue, where d is the damping, K the stiffness and T the delay
+        (docs/theory/damping-conditions.md).
         """
         if self.find_balancing_weights() is None:
             return None
@@ -154,10 +155,11 @@ class DominanceMatrix:
     def find_beta(self) -> Array:
         """Returns the weights beta of the sites in the energy function of the proof.
 
-        They are the positive solution of beta' = beta' alpha whose sum is 1 (beta' Upsilon = 0
-        in the paper's notation). The method is the elimination of Grassmann, Taksar and Heyman
-        (1985), which uses no subtractions. Each entry is therefore accurate to a few units in
-        the last place even if the dominance factors differ by many orders of magnitude.
+        The weights are the positive solution of beta' = beta' alpha whose entries sum to 1
+        (beta' Upsilon = 0 in the paper's notation). They are computed with the elimination
+        method of Grassmann, Taksar and Heyman (1985), which uses no subtractions. Each entry is
+        therefore accurate to a few units in the last place even if the dominance factors differ
+        by many orders of magnitude.
 
         Returns:
             The weights, shape (N,).
@@ -185,7 +187,7 @@ class DominanceMatrix:
         return normalised
 
     def find_pi(self) -> Array:
-        """Returns the left eigenvector pi for the eigenvalue 1, even of a reducible matrix.
+        """Returns the left eigenvector pi for the eigenvalue 1, even if alpha is reducible.
 
         The vector satisfies pi >= 0 and pi' alpha = pi', and its entries sum to 1. pi is 0 for
         sites outside closed groups, see `closed_groups`. With several closed groups, pi is
@@ -356,11 +358,12 @@ def _any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 @leaf
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Stops an arm while a peer that it follows is silent, and resumes afterwards.
+    """Holds the reference of an arm while a peer that it follows is silent.
 
-    A peer is silent if its last sample is too old. In mode HOLD, the reference stays where it
-    was. In BRAKE, it is the pose that the arm had when the peer fell silent. In RETURN, it
-    moves smoothly back to the position q_des computed from the peers:
+    A peer is silent if its last sample is too old. In the mode HOLD, the reference keeps its
+    last value. In BRAKE, the reference is the pose that the arm had when the peer fell silent.
+    In RETURN, once samples arrive again, the reference moves smoothly back to the position
+    q_des computed from the peers:
 
         reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
 
@@ -415,8 +418,9 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
 
     Here q_j, qd_j and tau_x_j are the position, velocity and external torque in the sample from
     peer j, alpha_ij is the dominance factor of this peer and alpha_ij' its derivative. `felt`
-    is the torque of operators and environments on the peers' arms. Terms are added in scenario
-    order, since any other order would change the last bits of the sums.
+    is the weighted sum of the torques that operators and environments exert on the peers' arms.
+    Terms are added in scenario order, since another order could change the last bits of the
+    sums.
 
     Args:
         t_ns: Time, ns since the epoch (the common start of the session).

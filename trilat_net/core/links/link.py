@@ -69,8 +69,8 @@ class ChannelArrays(NamedTuple):
             per entry of the ring buffer `LinkArrays.calendar`, shape (pages, C).
         received: Values received with the sample in use, shape (C,). Zeros before the first
             sample.
-        columns: Index of each value among all values received with a sample, shape (C,), or -1
-            for a value that the other law does not send; that value is 0.
+        columns: Index of each value among all values received with a sample, shape (C,). -1 for
+            a value that the other law does not send; such a value is 0.
     """
 
     waiting: Array
@@ -144,10 +144,10 @@ def calendar_pages(
     Args:
         rate_hz: Rate of the receiver's control loop, Hz.
         delay_us: Longest delay, us.
-        ahead_ns: Longest time by which a sender's clock may be ahead of the receiver's, ns.
+        ahead_ns: Largest amount by which a sender's clock may be ahead of the receiver's, ns.
 
     Returns:
-        The number of pages. It is a power of two, so that a modulo is a bit mask.
+        The number of pages, a power of two, so that a bit mask can replace a modulo operation.
     """
     longest_wait_ticks = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
     # Two ticks more: the present tick, and a reserve of one tick for rounding.
@@ -258,7 +258,7 @@ def accept_sample(
     """Stores a message received from another arm until its simulated delay has passed.
 
     A message that arrives after its delivery time is used in the current tick, unless a newer
-    one is already in use. Messages that cannot be used are counted as rejected, lost or
+    message is already in use. Messages that cannot be used are counted as rejected, lost or
     duplicate.
 
     Args:
@@ -324,13 +324,13 @@ def accept_sample(
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     """Starts using the newest message from another arm whose simulated delay has passed.
 
-    If no message is due in tick k, the previous one stays in use. Must be called once per
-    control period of the receiver, in order. Otherwise, messages stored by `accept_sample`
-    would stay in the calendar, which has one page per period.
+    If no message is due in tick k, the previous message stays in use. This function must be
+    called once per control period of the receiver, in order. Otherwise, messages stored by
+    `accept_sample` would stay in the calendar, which has one page per period.
 
-    Delivery times are computed here for all messages sent up to the time t_k of the tick, which
-    ensures that the first message after a long silence takes no longer to process than any
-    other.
+    Every call computes the delivery times of all messages sent up to the time t_k of the tick.
+    The first message after a long silence therefore takes no longer to process than any other
+    message.
 
     Args:
         k: Tick of the receiver.

@@ -32,7 +32,7 @@ class LinkSchedule:
 
     Args:
         setup: Setup of the link, as read by the kernel.
-        changed_models: Delay and loss models to which the link is changed during the run.
+        changed_models: Delay and loss models to which the link switches during the run.
 
     Attributes:
         models: All models of the link, ordered by start time.

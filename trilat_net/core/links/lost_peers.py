@@ -201,7 +201,7 @@ def _redistribute_shares(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Gives the weight of lost peers to the other peers, and restores it when they return.
+    """Transfers the weight of lost peers to the other peers until the lost peers return.
 
     Before the call, `alpha` of each link is its planned dominance factor; afterwards, it is the
     factor in force.
@@ -212,8 +212,8 @@ def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
     - -1: lost. When samples from the peer arrive again, the field becomes the time of its
       return.
     - Above 0: time of the return, ns. If the peer falls silent again, it is lost again. After
-      BACK_NS it becomes present, provided that it is near enough for the reference not to move
-      far.
+      BACK_NS the peer becomes present, provided that this moves the reference by no more than
+      `site.align_limit`.
 
     Args:
         t_ns: Time, ns since the epoch (the common start of the session).

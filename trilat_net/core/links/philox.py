@@ -41,8 +41,8 @@ DrawKey = np.uint64
 def link_key(seed: int, link: str) -> int:
     """Returns the key from which all random numbers of a network link are computed.
 
-    It depends on the seed of the run and the name of the link. Two links therefore have
-    independent delays, and running with the same seed reproduces them.
+    The key depends on the seed of the run and the name of the link. Two links therefore have
+    independent delays, and another run with the same seed has the same delays.
 
     Args:
         seed: Seed of the experiment.
@@ -92,7 +92,7 @@ def unit_interval(high: np.uint64, low: np.uint64) -> float:
 
         (52 random bits + 1/2) / 2^52
 
-    The result is exact. With 53 bits, the largest value would round to 1.
+    The result is exact. With 53 random bits, the largest value would be rounded to 1.
 
     Args:
         high: Word that provides the upper bits.
@@ -107,14 +107,14 @@ def unit_interval(high: np.uint64, low: np.uint64) -> float:
 def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
     """Returns two random numbers, uniformly distributed on the open interval (0, 1).
 
-    They are a function of the arguments, so a run can be repeated. Draws with different
+    The numbers are a function of the arguments, so a run can be repeated. Draws with different
     arguments are independent.
 
     Args:
         key: Key of the link.
         sample: Index of the sample for which the numbers are drawn.
         purpose: Distinguishes several draws for the same sample.
-        attempt: Attempt of a method that rejects draws, starting at 0.
+        attempt: Number of the attempt, starting at 0, for a method that rejects some draws.
     """
     index = np.uint64(sample)
     a, b, c, d = philox(
@@ -138,7 +138,7 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
         key: Key of the link.
         sample: Index of the sample for which the number is drawn.
         purpose: Distinguishes several draws for the same sample.
-        attempt: Attempt of a method that rejects draws, starting at 0.
+        attempt: Number of the attempt, starting at 0, for a method that rejects some draws.
     """
     u, v = uniforms(key, sample, purpose, attempt)
     radius = math.sqrt(-2.0 * math.log(u))
@@ -150,7 +150,7 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
 def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> float:
     """Draws a random number from a gamma distribution with scale 1.
 
-    This is the rejection method of Marsaglia and Tsang, "A Simple Method for Generating Gamma
+    Uses the rejection method of Marsaglia and Tsang, "A Simple Method for Generating Gamma
     Variables", ACM TOMS 26 (2000), in the notation of that paper. If the shape k is below 1, a
     number with shape k + 1 is drawn and multiplied by u^(1 / k), where u is uniform from 0 to
     1.

@@ -125,8 +125,8 @@ def law_stage(
 ) -> None:
     """Computes the torque of an arm in one tick with a user's compiled law.
 
-    The field `asked` of the site is 1 while the law runs, which allows an exception to be
-    attributed to the law.
+    The field `asked` of the site is 1 while the law runs, which shows whether an exception came
+    from the law.
 
     Args:
         k: Number of the tick.
@@ -271,8 +271,8 @@ def _compile_law(torque: Callable[..., Any], form: LawForm) -> Any:
         """Collects the input of the control law, and calls the law's method `torque`.
 
         Nothing is copied: the law reads and writes the arrays of its site. The data are passed
-        as arrays of floats, and views of these arrays give the law access to the same memory as
-        a record with named fields.
+        as arrays of floats. The law accesses them through views that have named fields and
+        share the memory of these arrays.
 
         Args:
             law: Gains and memory of the law.
@@ -490,7 +490,7 @@ class CompiledLaw:
             gains.
         address: Address of the law's machine code.
         form: Layouts of the arrays of the law.
-        torque: Method of the law's class that computes the torque, not compiled.
+        torque: Method of the law's class that computes the torque, before compilation.
 
     Raises:
         ScenarioError: Numba cannot compile the law.
@@ -603,7 +603,7 @@ class CompiledLaw:
     def memory(self) -> list[float]:
         """State vector that the control law keeps from this tick to the next.
 
-        The vector is stored in the log, which allows `restore` to continue a run from this
+        The vector is stored in the log, so that `restore` can later continue the run from this
         tick.
         """
         memory: list[float] = self.row[: self._remembered].tolist()
@@ -629,8 +629,8 @@ class CompiledLaw:
             error: Exception raised while the torque of a tick was computed.
 
         Returns:
-            An exception that names the law and the reason. None if the error originates in the
-            program itself, since its bugs must not be attributed to the user.
+            An exception that names the law and the reason. None if the error originates in this
+            program, since a bug of the program must not be blamed on the user's law.
         """
         s: Row = self._arrays.site[0]
         was_law_running = bool(s.asked)

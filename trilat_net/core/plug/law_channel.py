@@ -62,10 +62,10 @@ class _SentEntry(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Label of the value, for example "E" or "u[m2]".
+        """Label of the vector that contains the value, for example "E" or "u[m2]".
 
-        The label is the name of the vector that contains the value. If the vector is sent to a
-        single peer, the name of this peer follows in brackets.
+        The label is the name of the vector. If the vector is sent to a single peer, the name of
+        this peer follows in brackets.
         """
         return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
 
@@ -88,7 +88,7 @@ class LawChannel(NamedTuple):
     peers: int = 0
 
     def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
-        """Returns the vectors that are the same for all peers, or those that differ.
+        """Returns the vectors that are the same for all peers, or those that differ by peer.
 
         Args:
             per_peer: True for the vectors that are different for each peer, False for the
@@ -97,7 +97,7 @@ class LawChannel(NamedTuple):
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Counts the values that the law sends to all peers alike, or to one peer alone.
+        """Counts the values that the law sends to every peer alike, or only to a single peer.
 
         Args:
             per_peer: True to count the values for one peer in the vectors that differ between
@@ -109,14 +109,14 @@ class LawChannel(NamedTuple):
     def received_size(self) -> int:
         """Number of values that one peer receives from the law with each message.
 
-        They comprise the vectors that are the same for all peers, and this peer's copy of each
-        vector that differs between peers.
+        These are the values of the vectors that are the same for all peers, and of the vectors
+        for this peer alone.
         """
         return sum(vector.length for vector in self.vectors)
 
     @property
     def record_size(self) -> int:
-        """Number of floats that the law sends to all peers in one tick.
+        """Number of floats that the law sends to all peers together in one tick.
 
         This is the length of the field `ch` in the log. A vector that differs between peers
         counts once per peer.
@@ -128,9 +128,9 @@ class LawChannel(NamedTuple):
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Locates the values that a receiving control law reads in a message of this law.
+        """Locates, in the messages of this law, the values that another control law reads.
 
-        The receiver may read fewer vectors, and in a different order.
+        The other law may read fewer vectors than this law sends, and in a different order.
 
         Args:
             vectors: The vectors that the other law reads.
@@ -175,7 +175,7 @@ class LawChannel(NamedTuple):
                     yield _SentEntry(vector, peer, n)
 
     def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
-        """Returns the values sent by a control law that one peer receives.
+        """Selects the values that one peer receives from all values sent by a control law.
 
         These are the values for all peers, and the values for this peer alone.
 

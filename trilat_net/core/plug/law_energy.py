@@ -41,8 +41,8 @@ class PeerRecords(NamedTuple):
 class LawRecords(NamedTuple):
     """Recorded motion, torques and messages of one arm in K ticks.
 
-    A control law computes its energy account from them, which shows whether the law was
-    passive.
+    A control law computes its energy account from these records. The account shows whether the
+    law was passive, which means that it produced no energy.
 
     Attributes:
         h_s: The control period, s.
@@ -76,7 +76,7 @@ class LawRecords(NamedTuple):
         """Selects the values that the law of a site exchanged with one peer in K ticks.
 
         The key of a vector sent to all peers is its name. The key of a vector for a single peer
-        also contains this peer, for example "wave[s]".
+        also contains the name of this peer, for example "wave[s]".
 
         Args:
             site: Name of the site.
@@ -105,8 +105,8 @@ class LawRecords(NamedTuple):
     def sum_work(self, tau: Array) -> Array:
         """Returns the work done by a joint torque since the start of the run, at each tick.
 
-        The torque is constant from one tick to the next. Its work in this period is the torque
-        times the change of the joint angles, summed over the joints.
+        The torque is constant from one tick to the next. The work done between two ticks is the
+        torque times the change in the joint angles, summed over the joints.
 
         Args:
             tau: Torque held from each tick to the next, shape (K, n), N m.

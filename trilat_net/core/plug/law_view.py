@@ -49,8 +49,8 @@ def update_law_view(
 ) -> None:
     """Prepares the input of a user's control law: time, arm model and ages of the samples.
 
-    The rest of the input is already in place. The torque is set to NaN, so that a law that does
-    not write its torque is detected.
+    The rest of the input is already in place. The torque is set to NaN, so that the caller can
+    tell whether the law has written a torque.
 
     Args:
         k: Number of the tick.
@@ -192,8 +192,8 @@ class PlainLaw:
     def memory(self) -> list[float]:
         """State vector that the law keeps from this tick to the next.
 
-        The vector is stored with the results of each tick, which allows `restore` to continue
-        the run.
+        The vector is stored with the results of each tick, so that `restore` can later continue
+        the run from this tick.
         """
         return self._law.memory
 

@@ -67,7 +67,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
                 tuple of its arguments.
 
         Returns:
-            The LLVM value of None, the result of the call in Python.
+            The LLVM value that represents None, because the called function returns nothing.
         """
         convention = context.call_conv
         address_value, tuple_value = values
@@ -111,8 +111,8 @@ call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
     """Returns a hash of all source files in a function's folder.
 
-    Compiled code is cached on disk under this hash. A change to any of the files changes the
-    hash, and the function is recompiled.
+    Compiled code is cached on disk under this hash. If any of the files changes, the hash
+    changes too, and the function is compiled again.
 
     Args:
         function: A function.
@@ -191,7 +191,7 @@ def _compile(
 
 
 class UserModel:
-    """A user's model in the form required by the simulation: parameters and machine code.
+    """A user's model in the form that the simulation requires: parameters and machine code.
 
     Args:
         model: A model of an operator, an environment or network delays.

@@ -24,7 +24,7 @@ from ..step.vectors import Vector
 
 
 class LawContext(NamedTuple):
-    """Facts about the arms that a control law receives when it is created.
+    """Facts about an arm and its peers, which a control law receives when it is created.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
@@ -65,7 +65,7 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """
 
     def compute(vector: "LawVector", other: Any) -> Any:
-        """Applies an operation, such as addition, to two vectors or to a vector and a number.
+        """Applies an operation, such as addition, to two vectors, or to a vector and a number.
 
         Args:
             vector: The first vector.
@@ -210,13 +210,13 @@ class UserLaw(Protocol):
 
     A law may also define:
 
-    - Its memory. State that `torque` keeps between ticks must be declared, because otherwise a
-      run could not be repeated. Either the class lists the attribute names in `remembers`, or a
-      method `memory()` returns the state vector and a method `recall(memory)` restores it.
+    - A memory. Any state that `torque` keeps between ticks must be declared, because otherwise
+      a run could not be repeated. Either the class lists the attribute names in `remembers`, or
+      a method `memory()` returns the state vector and a method `recall(memory)` restores it.
     - An attribute `theta_hat` with one value per dynamic parameter, which is stored in the
       records.
-    - `holds = True`, if the law depends on the other arms only through the reference. Its
-      torque is then also used while the arm is at rest.
+    - An attribute `holds = True`, if the law depends on the other arms only through the
+      reference. The torque of the law is then also used while the arm is at rest.
     """
 
     def torque(self, now: LawInput) -> Sequence[float] | None:
@@ -237,7 +237,7 @@ UserLawFactory = Callable[[LawContext], UserLaw]
 
 
 class SiteLaw:
-    """A user's control law at one site: calls the law, and handles its memory and errors.
+    """Calls a user's control law at one site, and handles the law's memory and errors.
 
     Args:
         law: An instance of the law's class.
@@ -250,7 +250,7 @@ class SiteLaw:
 
     @property
     def name(self) -> str:
-        """Name with which a scenario selects the law, for example "mylaws:Spring"."""
+        """Name by which a scenario selects the law, for example "mylaws:Spring"."""
         kind = type(self._law)
         return f"{kind.__module__}:{kind.__qualname__}"
 
@@ -259,7 +259,7 @@ class SiteLaw:
         """Names of the attributes that the law keeps from one tick to the next.
 
         The law's class lists them in `remembers`, for example `remembers = ("x",)`. Their
-        values are stored in the log, which makes a run repeatable. Empty for a law without
+        values are stored in the log, so that a run can be repeated. Empty for a law without
         memory.
         """
         return tuple(getattr(self._law, "remembers", ()))
@@ -358,7 +358,8 @@ class SiteLaw:
     def check_results(self, tick: int, results: "LawResults") -> None:
         """Raises LawFailed if a result is not finite or the memory is too large.
 
-        A NaN torque would make the simulation useless, and a large memory would fill the log.
+        A torque of NaN would make the simulation useless, and a large memory would fill the
+        log.
 
         Args:
             tick: Number of the tick, for the error message.

@@ -52,12 +52,12 @@ class _HandActor(Protocol):
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns the operator's next actions: how firmly and where the operator pulls the arm.
 
-        The actions start at tick `k`. They stop before the first tick whose action depends on
+        The actions start at tick `k`. They end before the first tick whose action depends on
         an arm state that has not been computed yet.
 
         Args:
             k: First tick.
-            end: Tick before which the actions must stop.
+            end: Tick before which the actions must end.
             arrays: State of the site before tick `k`.
 
         Returns:
@@ -88,8 +88,8 @@ class RunTotals(NamedTuple):
 
     Attributes:
         rms_error_rad: Root mean square over the run of the synchronisation error e, which is
-            the difference between a joint angle and its reference, in rad. The value is the
-            largest of all joints of all sites.
+            the difference between a joint angle and its reference, in rad. The value is that of
+            the joint with the largest root mean square, among all joints of all sites.
         effort_nm: Root mean square of tau - G(q) over sites and joints, in N m, where tau is
             the control torque and G(q) the torque that compensates for gravity in pose q.
         force_peak_n: Largest force exerted by a wall on an arm, in N. None if there is no wall.
@@ -490,8 +490,8 @@ class CompiledRun:
     def plan(self, ticks: Sequence[int]) -> None:
         """Sets the total number of ticks of each site, and allocates memory for them.
 
-        This enlarges the arrays that hold the largest values per 50 ms interval (bucket) and
-        the actions of live operators, and keeps their contents.
+        Two arrays are enlarged without losing their contents: one with the largest values per
+        50 ms interval (bucket), and one with the actions of live operators.
 
         Args:
             ticks: Total number of ticks per site, in scenario order, including ticks that have
@@ -543,7 +543,7 @@ class CompiledRun:
     def programmed_sites(self) -> set[int]:
         """Indices of the sites whose operator or arm is a user's own program.
 
-        These programs are called from Python in every control period, which is slower.
+        These programs are called from Python in every control period, which slows the run down.
         """
         return {*self._hands, *self._plants}
 
@@ -599,7 +599,7 @@ class CompiledRun:
     def displace(self, field: str, offsets: Array) -> None:
         """Adds offsets to one field of the state of all sites, for example to the joint angles.
 
-        This is how the small perturbation is applied to a twin (a repeat of the run).
+        This method applies the small perturbation to a twin (a repeat of the run).
 
         Args:
             field: Field name, for example "q" for the joint angles or "qd" for the velocities.
@@ -779,9 +779,9 @@ class CompiledRun:
         return self.ran_s >= self.duration_s or self.diverged_s is not None
 
     def find_batch_end(self) -> float:
-        """Returns how far the run may continue before its records must be read, as a time in s.
+        """Returns the time, in s, up to which the run may continue before its records are read.
 
-        Until then, no site produces more records than the run keeps (see `keep` in the
+        Until this time, no site produces more records than the run keeps (see `keep` in the
         constructor). The result never exceeds the duration of the scenario.
         """
         fastest_hz = max(self.rates_hz)
@@ -790,8 +790,8 @@ class CompiledRun:
     def iterate_batches(self) -> Iterator[list[tuple[IntArray, Array]]]:
         """Simulates the scenario to its end, and yields all records batch by batch.
 
-        Even a long run only needs memory for the latest `keep` records of each site. `keep`
-        must be at least 2.
+        Even a long run needs memory only for the latest `keep` records of each site. `keep`, an
+        argument of the constructor, must be at least 2.
 
         Yields:
             The records since the previous batch, in the same form as `pop_records`.
@@ -804,8 +804,8 @@ class CompiledRun:
         """Returns which samples a site used in its latest ticks, shape (count, peers).
 
         Which samples are used depends only on the link delays, so the result is recomputed
-        instead of stored. It is not valid for a run that repeats a log, where samples arrive as
-        recorded.
+        instead of stored. The result is not valid for a run that repeats a log, in which
+        samples arrive as recorded.
 
         Args:
             i: Index of the site.

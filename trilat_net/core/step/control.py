@@ -155,9 +155,9 @@ def adaptive_torque(
 def robust_torque(rho: float, width: float, r: float) -> float:
     """Returns rho r / sqrt(r^2 + width^2), a torque that opposes a bounded disturbance.
 
-    The robust torque is a smooth version of rho sign(r), and is subtracted by the control law.
-    If the disturbance d of the joint is at most rho in magnitude, the remaining power (d -
-    robust torque) r is at most ROBUST_RESIDUE rho width.
+    The robust torque is a smooth version of rho sign(r), which the control law subtracts. If
+    the disturbance d of the joint is at most rho in magnitude, the remaining power (d - robust
+    torque) r is at most ROBUST_RESIDUE rho width.
 
     Args:
         rho: Largest robust torque, N m.
@@ -183,7 +183,7 @@ def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
     The stability proof still holds with this projection. If the adaptation gain Gamma is
     diagonal and the true parameters theta are within the bounds, the projection never increases
     (theta_hat - theta)' Gamma^-1 (theta_hat - theta). The energy function V of the proof
-    contains this term, so V still never rises.
+    contains this term, so V still never increases.
 
     Args:
         theta_hat: Parameter estimate, shape (5,).

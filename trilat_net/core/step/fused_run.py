@@ -37,9 +37,9 @@ PROGRESS_DTYPE = row_dtype("progress", {})
 
 
 class RecentRecords(NamedTuple):
-    """The latest records of a site, kept until all peers have received them.
+    """The latest records of a site, in a ring buffer.
 
-    A record stays in this ring buffer only as long as a delayed message may still need it. For
+    The buffer is long enough that all peers receive a record before it is overwritten. For
     several sites, the arrays have an additional leading axis.
 
     Attributes:
@@ -86,7 +86,8 @@ class ReplayedInputs(NamedTuple):
         samples: Ticks in which the peers sent the samples, in order of arrival.
         hands: Actions of the person or program that moves each arm, by site and tick, shape (N,
             K, 1 + 2 m). The columns are the grip firmness from 0 to 1, the m target
-            coordinates, and the target one second later. If K is 0, nobody holds the arms.
+            coordinates, and these coordinates extrapolated by one second. If K is 0, nobody
+            holds the arms.
         hand_indices: For each site, the index of this person or program among its torque
             sources (operators and environments), or -1 if nobody moves the arm. Shape (N,).
     """
@@ -196,18 +197,18 @@ def _apply_recorded_hand(
     """Repeats a live operator's action on an arm in one control period of a recorded run.
 
     A live operator (hand) is simulated by a spring that pulls the arm to a target. The grip (a
-    factor of the force), the target, and the target one second later are written to the row of
-    the live hand. Nothing happens if there is no live hand, or after the end of the recorded
-    run.
+    factor of the force), the target, and the target extrapolated by one second are written to
+    the row of the live hand. Nothing happens if there is no live hand, or after the end of the
+    recorded run.
 
     Args:
         i: Index of the site.
         k: Current tick.
         actors: Operators and environments of the site. The fields `a` and `b` of a live hand
-            are its target and its target one second later, m or rad.
+            are its target and its target extrapolated by one second, m or rad.
         feed: Inputs of the recorded run. For each site and tick, `feed.hands` contains the
-            grip, 0 to 1, the coordinates of the target, and those of the target one second
-            later.
+            grip, 0 to 1, the coordinates of the target, and these coordinates extrapolated by
+            one second.
     """
     index = feed.hand_indices[i]
     has_live_hand = index >= 0
@@ -235,8 +236,8 @@ def update_peaks(
 ) -> None:
     """Updates the peak errors and speeds of an arm, and its error sums, with a new record.
 
-    A simulation of many runs keeps these statistics instead of the records. Peaks are kept per
-    time interval (bucket).
+    A simulation of many runs keeps these statistics instead of the records. It keeps one set of
+    peaks per time interval (bucket).
 
     Args:
         row: Floating-point values of the record.
@@ -360,7 +361,7 @@ def update_sums(
     row: Array,
     sums: SumsRow,
 ) -> None:
-    """Adds a control period to the sums of an arm's motor effort and its environments' work.
+    """Adds one control period to the sums of an arm's motor effort and its environments' work.
 
     The effort is the sum of the squares of control torque minus gravity torque. The work in a
     control period is the torque times the change in the joint angles q. For a torque that
@@ -596,7 +597,7 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Completes the control period of one arm that `sense_site` has started.
+    """Completes a control period of one arm, which `sense_site` has begun.
 
     The control law computes the torque, the arm moves on to the next period, and the results
     are added to the statistics of the run.

@@ -115,9 +115,9 @@ _ships = _SHIPPED.is_dir()
 def is_core_cached() -> bool:
     """Returns True if a simulation can start immediately, without compiling the core first.
 
-    Commands use this to announce that the first run will take longer. Only the function
-    `kernel.site_tick` is looked up on disk: it is compiled last, so if it is there, the others
-    are too.
+    Commands use this result to announce that the first run will take longer. Only the function
+    `kernel.site_tick` is looked up on disk: it is compiled last, so if it is there, the other
+    functions are too.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -270,9 +270,9 @@ class _LeafCacheImpl(CompileResultCacheImpl):
     def rebuild(self, context: Any, content: Any) -> Any:
         """Converts the content of a cache file to a compiled function.
 
-        For the machine code of a leaf, this is left to Numba. For the LLVM code of an inner
-        leaf, this method creates the objects that Numba would have after a compilation. Numba
-        has no public interface for this, so private names are used.
+        If the file contains machine code, Numba itself converts it. If the file contains LLVM
+        code, this method creates the objects that Numba would have after a compilation. Numba
+        has no public interface for this conversion, so private names are used.
 
         Args:
             context: Numba's description of the target processor.
@@ -328,9 +328,9 @@ class _CompressedFiles(IndexDataCacheFile):
     def save(self, key: Any, code: Any) -> None:
         """Writes compiled code to a file, and adds the file to the cache index.
 
-        The index maps each key to a file name. Numba would number the files, so two processes
-        that compile at the same time could pick the same number. The names used here contain a
-        hash of the key instead.
+        The index maps each key to a file name. Numba itself would number the files, so two
+        processes that compile at the same time could choose the same number. The names used
+        here contain a hash of the key instead.
 
         Args:
             key: Argument types and processor for which the code was compiled.
@@ -424,9 +424,9 @@ class _LeafCache(FunctionCache):
         return None if content is None else self._impl.rebuild(context, content)
 
     def save_inner(self, argument_types: Any, result: Any) -> None:
-        """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
+        """Stores the LLVM code of a function that only other compiled functions can call.
 
-        The files are kept separate from the machine code that is called from Python. Nothing is
+        The files are separate from those with machine code, which Python can call. Nothing is
         stored if no cache directory is writable.
 
         Args:
@@ -502,11 +502,11 @@ class _LeafCompiler(Compiler):
     has_distinct_arguments = False
 
     def compile_extra(self, function: Any) -> Any:
-        """Compiles a leaf to machine code that Python can call, or to LLVM code.
+        """Compiles a numerical function (leaf) to machine code, or to LLVM code.
 
-        If this happens while another leaf is being compiled, the other leaf must be the caller.
-        The function is then an inner leaf, and only LLVM code is produced, which becomes part
-        of the caller. Called by Numba.
+        Python can call machine code. LLVM code is produced if another leaf is being compiled at
+        the same time, because this leaf is then the caller of the function. The function is
+        called an inner leaf, and its LLVM code becomes part of the caller. Called by Numba.
 
         Args:
             function: The Python function.
@@ -675,11 +675,11 @@ class _Leaf(CPUDispatcher):
     def add_overload(self, result: Any) -> None:
         """Registers a compiled form of the function for later calls with the same types.
 
-        A leaf called from Python is compiled to machine code. An inner leaf, compiled because
-        another leaf calls it, is LLVM code that cannot be executed. Both are added to
-        `overloads`, where compiled callers look up a function by its argument types. Numba's
-        own method would also add it to the table of functions callable from Python, where an
-        inner leaf must not appear. Called by Numba.
+        A function (leaf) that is called from Python is compiled to machine code. A function
+        that is compiled because another leaf calls it (an inner leaf) is stored as LLVM code,
+        which Python cannot call. Both forms are added to `overloads`, where compiled callers
+        look up a function by its argument types. Numba's own method would also add an inner
+        leaf to the table of functions callable from Python. Called by Numba.
 
         Args:
             result: Numba's description of the compiled form.
@@ -703,7 +703,8 @@ class _Leaf(CPUDispatcher):
             signature: Argument types, in any form that Numba accepts.
 
         Returns:
-            The compiled function. For LLVM code, a placeholder for it in Numba's tables.
+            The compiled function. For LLVM code, the placeholder that represents the function
+            in Numba's tables.
         """
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
@@ -767,8 +768,9 @@ def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Decorator that compiles a numerical function with Numba on its first call.
 
     Unlike with `numba.njit`, the function must not allocate arrays, and the compiled code is
-    cached on disk until a source file of this package changes. Readers and type checkers see
-    the type of the original function. If Numba is disabled, returns the function itself.
+    cached on disk until a source file of this package changes. For type checkers, the decorated
+    function has the same type as the original. If Numba is disabled, returns the function
+    itself.
     """
     if _config.DISABLE_JIT:
         return function
@@ -790,10 +792,10 @@ def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Calla
 
 
 def loop_leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorator for a function with a long loop that calls other leaves.
+    """Decorator like `leaf`, for a function with a long loop that calls other functions.
 
-    All leaves called by the loop are inlined into its code, which saves the cost of passing
-    array descriptors to them. Python calls the function like any other leaf.
+    The compiler inlines these functions into the loop, which saves the cost of passing array
+    descriptors to them. From Python, the function is called like one decorated with `leaf`.
     """
     return leaf(function) if _config.DISABLE_JIT else _make_leaf(function, _LoopCompiler)
 
@@ -802,9 +804,9 @@ def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
     """Decorator for a function that computes several simulations at once, using SIMD.
 
     Each simulation occupies a lane, which is a position in the processor's vector registers.
-    The compiler needs two guarantees, for the decorated function only: all functions that it
-    calls are inlined, and no two of its arguments overlap in memory. The caller must ensure the
-    latter. Compiled code calls such a function by its address (`LaneCode`).
+    All functions that the decorated function calls are inlined into it. The compiler assumes
+    that no two of its arguments overlap in memory, which the caller must ensure. Compiled code
+    calls the decorated function by its address, see `LaneCode`.
     """
     return _make_leaf(function, _LaneCompiler)
 
@@ -833,7 +835,7 @@ class LaneCode:
         self._argument_types = argument_types
 
     def find_address(self) -> int:
-        """Returns the memory address at which other compiled code can call this code.
+        """Returns the memory address at which other compiled code can call the function.
 
         Compiles the function if necessary. The code is not cached on disk if any argument type
         has an `is_stored` attribute that is False.
@@ -847,7 +849,7 @@ class LaneCode:
         return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
     def is_stored(self) -> bool:
-        """Returns True if the machine code is already on disk.
+        """Returns True if the machine code is already in memory or on disk.
 
         If not, the first use of the function is slow, because the function must be compiled
         first.
@@ -862,8 +864,8 @@ class LaneCode:
     def read_assembly(self) -> str:
         """Returns the assembly code of the function.
 
-        A test uses it to check that the code contains vector instructions, without which the
-        function would be slow.
+        A test uses the assembly code to check that it contains vector instructions, without
+        which the function would be slow.
         """
         # Numba has no assembly text for code from the cache.
         compiled = _make_unstored(self._dispatcher.py_func)
@@ -874,7 +876,7 @@ class LaneCode:
 def set_lane_form(
     function: Callable[..., Any], choose: Callable[[tuple[Any, ...]], Callable[..., Any]]
 ) -> None:
-    """Registers another version of a function for code that computes several simulations.
+    """Registers another version of a function, for code that computes simulations in parallel.
 
     For example, `compute_law` of `core.lanes.lane_laws` has one version per control law,
     because all simulations that are computed side by side use the same law.
@@ -913,8 +915,8 @@ def compile_named(
         function: The closure. Its qualified name is changed to `name`.
         name: Name of the function.
         signature: Numba signature of the function.
-        **options: Options for `numba.njit`. The options shared by all leaves, such as disabling
-            reference counting, take precedence.
+        **options: Options for `numba.njit`. The options common to all functions compiled by
+            this module, such as disabling reference counting, take precedence.
 
     Returns:
         Numba's dispatcher for the compiled function.

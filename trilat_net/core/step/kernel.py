@@ -147,19 +147,19 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 def updates_estimate(k: int, s: SiteRow) -> bool:
     """Returns True if an adaptive law integrates its parameter estimate in this control period.
 
-    This is never the case in the first period of a site, nor under the scheme `digital`, which
-    integrates at the end of the period. Whether the mode allows adaptation is decided by
-    `adapts`.
+    The estimate is not integrated in the first period of a site. Under the scheme `digital`, it
+    is integrated elsewhere, at the end of the period. Whether the mode permits adaptation is
+    checked by `adapts`, not here.
     """
     return bool(not s.digital and k != s.first and s.law == _ADAPTIVE)
 
 
 @leaf
 def sum_trapezoid(s: SiteRow) -> None:
-    """Adds the adaptation rate Y' r of the previous control period to the current rate.
+    """Adds the adaptation rates Y' r of the previous and the current control period.
 
     The parameter estimate is integrated with the trapezoidal rule, which needs this sum. The
-    result is stored in `Yr_before`; see `_update_estimate`.
+    sum is stored in `Yr_before`; see `_update_estimate`.
     """
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
@@ -664,7 +664,7 @@ def act_stages(
     """Computes the part of a control period that follows the control law.
 
     Limits the torque, writes the record and moves the arm to the next period (stages 6 to 8).
-    For joints that exceed their speed limit, see `emit_stage`.
+    `emit_stage` describes what happens if a joint exceeds its speed limit.
 
     Args:
         k: Current tick.
@@ -744,8 +744,9 @@ def site_tick(
 def resume_stages(k: int, arrays: SiteArrays) -> None:
     """Completes the state of an arm restored from a log, to allow the run to continue.
 
-    Some values that the next tick needs are not in the log: the tracking errors, the external
-    torques, and the motion up to that tick. They are recomputed here from the restored state.
+    Some values that the next tick needs are not in the log: the tracking errors and external
+    torques of tick `k`, and the motion of the arm from tick `k` to the next tick. They are
+    recomputed here from the restored state.
 
     Args:
         k: The last recorded tick.

@@ -94,8 +94,8 @@ class RecordedRows(NamedTuple):
         first_arrival: Index of the first arrival of each record, shape (K + 1,).
         arrivals: Peer, tick, and row in the table of samples for each of N arrivals, shape (N,
             3).
-        hands: Grip, target, and target one second later of a live hand, shape (K, 1 + 2 m).
-            Shape (0, 0) if the site has no live hand.
+        hands: Grip and target of a live operator, and the target extrapolated by one second,
+            shape (K, 1 + 2 m). Shape (0, 0) if the site has no live operator.
         plants: q, qd and the torque ON an external arm, shape (K, 3 n). Shape (0, 0) if the arm
             is not external.
     """
@@ -438,8 +438,8 @@ class TickRepeater:
                 and tau_x, each as the bits of a floating-point value.
 
         Returns:
-            The number of ticks that were reproduced exactly. The site is left in the state
-            after them.
+            The number of ticks that were reproduced exactly. The site is left in the state that
+            follows the last of these ticks.
         """
         # Save the state, because a tick that differs has changed it.
         arrays = self._list_arrays()
@@ -528,7 +528,7 @@ def _list_memory_sources(site: Site) -> IntArray:
     link_type = site.arrays.links.dtype
 
     def add(dtype: np.dtype[Any], field: str, row: int = 0) -> None:
-        """Adds the positions of all elements of one field, counted in 8-byte words.
+        """Appends the positions of all elements of one field, counted in 8-byte words.
 
         Args:
             dtype: Type of the row (of the site or of a link).

@@ -23,7 +23,7 @@ from .vectors import Array
 
 
 class Field(NamedTuple):
-    """Description of one field of a structured array: its shape, unit, meaning and writer.
+    """Description of one field of a structured array: its shape, unit, meaning and origin.
 
     The data types of the arrays and their documentation are generated from these descriptions.
 
@@ -49,11 +49,11 @@ class Field(NamedTuple):
 
 
 class SiteRow(Protocol):
-    """Complete state of a site: settings, gains, motion and results, one field each.
+    """Complete state of a site, as fields for its settings, gains, motion and results.
 
     Compiled code reads and writes these fields of a structured array element. The axis "shared"
     has one element per coordinate that arms send to each other. Users' compiled control laws
-    read these fields through `LawInput`, so both use the same field names.
+    read these fields through `LawInput`, whose fields therefore have the same names.
     """
 
     rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]

@@ -24,7 +24,7 @@ class RunInputs(NamedTuple):
     Attributes:
         feed: Actions of live operators, and the ticks in which samples from other sites
             arrived.
-        changes: Changes of links or sites during the run, in chronological order. Each entry
+        changes: Changes to links or sites during the run, in chronological order. Each entry
             contains the tick before which the site applies the change, the index of the site,
             and the change.
         late_ns: Longest time from the time stamp of a sample to its arrival, in ns, which
@@ -37,11 +37,11 @@ class RunInputs(NamedTuple):
 
     @classmethod
     def prompt(cls, sites: int) -> "RunInputs":
-        """Returns the inputs of a run that receives nothing from outside.
+        """Returns the inputs of a run without external influences.
 
-        In such a run, every sample arrives promptly, in the first tick after it was sent. No
-        settings change, and no live operator moves an arm. Link delays from the setup still
-        apply, because they are simulated by the receivers.
+        In such a run, every sample arrives in the first tick after it was sent, no setting is
+        changed, and no live operator moves an arm. Link delays from the setup still apply,
+        because they are simulated by the receivers.
 
         Args:
             sites: Number of sites.
@@ -98,8 +98,8 @@ class RunInputs(NamedTuple):
           message; source of the message; target (m columns); velocity of the target (m
           columns).
         - Action in the feed (`ReplayedInputs.hands`): grip firmness; target (M columns); target
-          one second later, i.e. the sum of target and velocity (M columns). M is the largest m
-          of all sites. Columns beyond m stay zero.
+          extrapolated by one second, i.e. the sum of target and velocity (M columns). M is the
+          largest m of all sites. If m is smaller than M, the remaining columns stay zero.
 
         Args:
             i: Index of the site.

@@ -55,9 +55,9 @@ class RunMemory(NamedTuple):
 class RunState:
     """The complete state of a simulated run: all arrays that change, viewed as 64-bit integers.
 
-    Used to copy the state of one run to another, or to move it closer to the state of another
-    run. The views share memory with the run, so changing this object changes the run. Integer
-    views are used because equal integers mean equal bits.
+    Used to copy the state of another run to this run, or to move the state of this run closer
+    to that of another run. The views share memory with the run, so changing this object changes
+    the run. Integer views are used because equal integers mean equal bits.
 
     Args:
         arrays: Arrays that contain the state. Their memory is shared, not copied.

@@ -287,7 +287,8 @@ class SiteArrays(NamedTuple):
 
         There are four kinds of change:
 
-        - A notification that the site missed ticks. Their number is stored until the next tick.
+        - A notification that the site missed ticks. The number of missed ticks is stored until
+          the next tick.
         - An order, for example to stop the arm. It is carried out at the next tick. If several
           orders arrive before then, the one with the highest number takes precedence; see
           `LifeOrder`.
@@ -433,7 +434,8 @@ class CalendarSizer:
     does not fit is rejected later.
 
     Attributes:
-        newest: For each peer, the number of the newest sample known to fit now and later.
+        newest: For each peer, the number of the newest sample that is known to fit. All older
+            samples of the peer fit too.
         most_pages: Largest number of entries per buffer.
     """
 
@@ -450,9 +452,9 @@ class CalendarSizer:
             self.most_pages *= 2
 
     def clear(self) -> None:
-        """Forgets which messages are known to fit into the ring buffers of the links.
+        """Discards the information on which messages fit into the ring buffers of the links.
 
-        The next message of each sender will be checked again.
+        The next message from each sender will be checked again.
         """
         self.newest = [-1] * len(self.newest)
 
@@ -470,12 +472,12 @@ class CalendarSizer:
     def list_rooms(self) -> list[tuple[int, int]]:
         """Returns how long received samples may wait in their ring buffers, for each sender.
 
-        The compiled loop of `recorded_ticks` uses this to check whether a sample fits into its
-        buffer.
+        The compiled loop of `recorded_ticks` uses the result to check whether a sample fits
+        into its buffer.
 
         Returns:
-            For each sender, its entry of `newest` and the largest number of ticks that a sample
-            waits.
+            For each sender, its entry in `newest`, and the largest number of ticks for which a
+            sample waits.
         """
         longest_waits = []
         for delay_us in self._delay_us:

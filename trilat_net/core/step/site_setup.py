@@ -90,12 +90,12 @@ class StaleRule(NamedTuple):
 
     @property
     def glides(self) -> bool:
-        """True if the arm comes smoothly to rest while a peer is stale."""
+        """True if the arm comes smoothly to rest while a peer is silent for too long."""
         return self.action is StaleAction.GLIDE
 
     @property
     def is_active(self) -> bool:
-        """True if the site reacts to a stale peer in any way."""
+        """True if the site reacts in any way to a peer that is silent for too long."""
         return self.action is not StaleAction.USE
 
     @classmethod
@@ -183,12 +183,14 @@ class RestGains(NamedTuple):
     def stop_s(self, qd: Array) -> Array:
         """Returns how long it takes to bring an arm to rest from given joint velocities, s.
 
+        The arm is considered to be at rest when the reference of all its joints has stopped.
+        The calculation assumes that nothing else slows the joints down.
+
         Args:
             qd: Joint velocities of one or several arms, shape (..., n), rad/s.
 
         Returns:
-            The time in s for each set of n velocities, shape (...), after which the reference
-            of the joints has stopped, assuming that nothing else slows the joints down.
+            The time for each set of n velocities, shape (...), s.
         """
         stop_times_s = np.abs(qd) / self.deceleration
         slowest_s = stop_times_s.max(axis=-1)  # of the joints of an arm
@@ -249,8 +251,8 @@ class TaskSetup(NamedTuple):
         posture: Preferred joint angles, which the arm approaches as far as the motion of the
             end effector allows, rad.
         posture_rate: Rate at which the arm approaches these angles, 1/s.
-        singular_value: Threshold for damping the Jacobian near a singular pose: it is damped
-            where its smallest singular value may fall below this value, m/rad.
+        singular_value: Threshold for damping the Jacobian near a singular pose, m/rad. The
+            Jacobian is damped where its smallest singular value may fall below this threshold.
     """
 
     axes: tuple[float, ...]
@@ -329,12 +331,12 @@ class Gains(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """True if the kernel's law with a known gravity torque computes the torque."""
+        """True if the law is the built-in law that uses a known gravity torque."""
         return self.law is Law.KNOWN
 
     @property
     def is_user(self) -> bool:
-        """True if a Python class computes the torque, as with the laws of users."""
+        """True if the torque is computed by a Python class, such as a law written by a user."""
         return self.law is Law.USER
 
 
@@ -451,7 +453,7 @@ class SiteSetup(NamedTuple):
 
     @property
     def live_actor(self) -> int:
-        """Index of the live operator among the operators and environments, or -1 if none.
+        """Index of the live operator among the operators and environments, -1 if there is none.
 
         A live operator is a person or program that moves the arm during the run.
         """

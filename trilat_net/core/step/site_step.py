@@ -87,8 +87,8 @@ class _TickParts(NamedTuple):
 class Site:
     """An arm with its controller, and the network links over which it receives samples.
 
-    Each site process creates one such object and calls `step` once per control period. A
-    simulation in virtual time does the same for each arm.
+    Each site process creates one `Site` and calls `step` once per control period. A simulation
+    in virtual time does the same for each arm.
 
     Args:
         setup: Setup of the site.
@@ -169,8 +169,8 @@ class Site:
             index: Index of the live hand among the operators and environments.
 
         Returns:
-            The grip, shape (1,), the target, and the target one second later. They are views,
-            so writing to them moves the live hand.
+            The grip, shape (1,), the target, and the target extrapolated by one second. They
+            are views, so writing to them moves the live hand.
         """
         actors = self._arrays.actors
         # The field `hand` of a record contains grip, number, source, target and target
@@ -266,8 +266,8 @@ class Site:
     def step(self, tick: TickInput) -> TickRecord:
         """Computes one period of the control loop: from messages to torque and motion.
 
-        Time only advances through this method, whether in live runs, simulations or replays.
-        The same input therefore always produces the same results.
+        Time advances only through this method, in live runs as well as in simulations and
+        replays. The same input therefore always produces the same results.
 
         Args:
             tick: Number and inputs of the period. The number must follow that of the previous
@@ -457,7 +457,7 @@ class Site:
 
     @property
     def parts(self) -> "_TickParts":
-        """Internals that `recorded_ticks` uses to compute many control periods at once."""
+        """Internal data that `recorded_ticks` uses to compute many control periods at once."""
         return _TickParts(
             buffers=self._buffers,
             calendar_sizer=self._sizer,

@@ -91,9 +91,10 @@ class LifeReason(IntEnum):
 
     @classmethod
     def of_record(cls, output: TickRecord) -> "LifeReason":
-        """Returns why the arm of a record last changed its mode, for example to HOLD.
+        """Reads from a record why the arm last changed its mode, for example to HOLD.
 
-        The arm must be under the rule `glide`, as only then does the record contain the reason.
+        The site must use the rule `glide`, because the record contains the reason only under
+        this rule.
 
         Args:
             output: Record of the arm.
@@ -107,7 +108,7 @@ RELEASE_REASONS = (LifeReason.RELEASED, LifeReason.STOP_RELEASED)
 
 
 class LifeOrder(IntEnum):
-    """An order to a site, such as to stop the arm.
+    """An order to a site, for example to stop the arm.
 
     Orders exist only under the rule `glide`, which `session_life` explains. Users give these
     orders:
@@ -157,8 +158,8 @@ class DominanceRamp(NamedTuple):
 class CoreChange(NamedTuple):
     """A change to a running site, in the form read by the control loop.
 
-    It changes the model of a network link or the dominance factors, or gives an order such as
-    stop.
+    The change concerns the model of a network link or the dominance factors, or it is an order,
+    for example to stop.
 
     Attributes:
         text: Description stored in the record, from which any reader can reconstruct the
@@ -167,7 +168,7 @@ class CoreChange(NamedTuple):
         model: New model of the link.
         ramp: Change of the dominance factors.
         order: Order to the site.
-        skipped: With OVERRUN, the number of ticks before this one that the site missed.
+        skipped: With OVERRUN, the number of ticks that the site missed just before this change.
     """
 
     text: str
@@ -184,7 +185,8 @@ class CoreChange(NamedTuple):
         Args:
             text: Description stored in the record.
             order: Name of the order in a log, such as "stop", see `LifeOrder`.
-            skipped: With "overrun", the number of ticks before this one that the site missed.
+            skipped: With "overrun", the number of ticks that the site missed just before this
+                change.
         """
         return cls(text, order=LifeOrder[order.upper()], skipped=skipped)
 
@@ -215,7 +217,7 @@ class TickInput(NamedTuple):
     Attributes:
         k: Number of the period.
         arrivals: Samples that arrived since the previous period, in order of arrival.
-        commands: Changes of settings ordered since the previous period.
+        commands: Changes to settings that were ordered since the previous period.
         measured: Measured state of a real or otherwise external arm. None if there is no new
             measurement.
         hand: Action of a person or program on the arm in this period, see `live_hand`. Empty if
@@ -237,9 +239,9 @@ class LinkCounts(NamedTuple):
     Attributes:
         accepted: Samples that arrived.
         late: Samples that arrived after they were due.
-        duplicate: Arrived samples that had already arrived before.
-        refused: Arrived samples whose time stamp was out of range.
-        lost: Arrived samples that the loss model of the link dropped.
+        duplicate: Samples that arrived again.
+        refused: Samples that arrived, but whose time stamp was out of range.
+        lost: Samples that arrived, but were dropped by the loss model of the link.
         superseded: Samples that were never used, because a newer one was released before them
             or in the same tick.
         copies: Duplicates produced by the model of the link.
@@ -274,7 +276,7 @@ _REASONS = {
 
 
 class LifeAlarm(NamedTuple):
-    """An alarm that explains why an arm does not follow all the others, and how to end this.
+    """An alarm that explains why an arm does not follow all others, and what to do about it.
 
     It is created by `LifeAlarm.find`. Web pages and terminals show it as long as the site needs
     attention.

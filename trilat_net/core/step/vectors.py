@@ -95,7 +95,7 @@ def choose(condition: bool, if_true: float, if_false: float) -> float:
 
 @leaf
 def holds_anywhere(condition: bool) -> bool:
-    """Returns the condition, or, for several simulations, whether it holds in any of them.
+    """Returns True if a condition holds, or if it holds in any of several simulations.
 
     Code that is compiled for several simulations side by side may skip an operation only if
     none of them needs it; see `choose`.
@@ -119,12 +119,12 @@ def whole(number: float) -> int:
 def count_started(table: Any, first: int, count: int, now: float) -> int:
     """Counts the rows of a time-sorted table that start at or before a given time.
 
-    For example, this finds the row of a recorded torque that applies now. The first column
-    contains the times, and the count is found by bisection.
+    The count is used, for example, to find the row of a recorded torque that applies now. The
+    first column contains the times, and the count is found by bisection.
 
     Args:
         table: The table.
-        first: Index of the first row to search. Rows before it serve other purposes.
+        first: Index of the first row to search. Earlier rows of the table are ignored.
         count: Number of rows to search.
         now: The time, in the unit of the first column.
 
