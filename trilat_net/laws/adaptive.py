@@ -38,19 +38,20 @@ _GRAVITY = slice(3, 5)
 
 
 class Adaptive(ControlLaw):
-    """Adaptive law of the paper, which learns the dynamics of its arm, Eq. (13) and (15).
+    """Adaptive control law that learns the dynamics of its arm, Eq. (13) and (15).
 
     In the absence of external torques, the loop is stable for any constant delays if the
     dominance matrix is irreducible and the matrices Kd of all sites differ only by scalar
-    factors (the paper's theorem, with the weights of docs/theory/errata-proof.md). The
-    condition is sufficient, and does not cover varying delays.
+    factors (stability theorem of the paper cited in the module docstring, with the weights of
+    docs/theory/errata-proof.md). The condition is sufficient, and does not cover varying
+    delays.
 
     With Gamma = 0 and theta_hat0 = theta, this is the law with known parameters. Kd = 0 removes
     the damping of the error.
 
     Attributes:
         Lambda: Rate at which errors decay, per joint, 1/s.
-        Kp: Damping of r = qd + Lambda e, per joint, N m s/rad.
+        Kp: Damping gain of the filtered error r = qd + Lambda e, per joint, N m s/rad.
         Kd: Damping of the error, per joint, N m s/rad.
         Gamma: Adaptation gain per parameter.
         theta_hat0: Initial estimate of theta, Eq. (24).
@@ -127,10 +128,10 @@ class Adaptive(ControlLaw):
     def find_sampling_excess(self, g_m_s2: float, tick_s: float) -> float | None:
         """Returns Kp - Gamma g^2 h, which must be positive for the arm to come to rest.
 
-        If gravity is estimated too fast for the tick period h, the arm keeps swinging. This is
-        a rule of thumb for arms of about 1 m, because a factor of length squared, about 1 m^2,
-        is omitted. Only the gains of the parameters in the gravity torque matter, and the
-        largest of them is used.
+        If the estimate of the gravity torque adapts too fast for the tick period h, the arm
+        keeps swinging. Kp is the smallest entry of the gain `Kp`, and Gamma the largest
+        adaptation gain among the parameters of the gravity torque. This is a rule of thumb for
+        arms about 1 m long: a factor of length squared, about 1 m^2, is omitted.
 
         Args:
             g_m_s2: Gravitational acceleration g, m/s^2.

@@ -30,8 +30,8 @@ class AdaptiveBox(Adaptive):
     on the bounds, the projection preserves the stability proof: the energy function V of the
     proof never increases (V' <= 0).
 
-    Without bounds, an estimate that learns gravity acts like a spring that pulls the arms back
-    to a pose. This effect disappears if the true parameters lie strictly between the bounds.
+    Without bounds, learning the gravity torque acts like a spring that pulls each arm towards
+    one pose. This effect disappears if the true parameters lie strictly between the bounds.
 
     Source: Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4, for the projection.
 
@@ -86,7 +86,7 @@ class AdaptiveBox(Adaptive):
             sites: Number of sites, unused by this law.
 
         Raises:
-            ScenarioError: A bound or an estimate is invalid. The error names the key.
+            ScenarioError: A bound or an estimate is invalid. The message contains the key.
         """
         parameters = zip(self.theta_low, self.theta_hat0, self.theta_high, strict=True)
         for n, (low, first, high) in enumerate(parameters):

@@ -140,24 +140,24 @@ def _jacobian_rate_times(
 
 @compiled
 class AdaptiveKinematics(ControlLaw):
-    """Adaptive law for end-effector positions of planar arms with unknown lengths.
+    """Adaptive law that couples the end effectors of planar arms with unknown link lengths.
 
     The positions and velocities of the end effectors are measured and compared in a common
-    frame. Masses and lengths are learnt.
+    frame. Masses and link lengths are learnt.
 
     Source: C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive tracking control for robots with
     unknown kinematic and dynamic properties", Int. J. Robotics Research 25(3), 283-296, 2006.
 
     Attributes:
         Lambda: Rate at which errors decay, per coordinate x and y, 1/s.
-        Kp: Damping of r, per joint, N m s/rad.
+        Kp: Damping gain of the filtered error r, per joint, N m s/rad.
         Kd: Damping of the error, per coordinate, N s/m.
         Gamma: Adaptation gain per parameter.
         theta_hat0: Initial estimate of theta, Eq. (24).
-        length_gain_m_n: Adaptation gain of the lengths, m/N.
-        lengths0_m: Initial estimate of the two lengths, m.
-        least_m: Lower bound of both lengths, m.
-        most_m: Upper bound of both lengths, m.
+        length_gain_m_n: Adaptation gain of the link lengths, m/N.
+        lengths0_m: Initial estimates of the two link lengths, m.
+        least_m: Lower bound on the estimate of each link length, m.
+        most_m: Upper bound on the estimate of each link length, m.
     """
 
     Lambda: PositiveJoints = (1.0,)
@@ -188,8 +188,8 @@ class AdaptiveKinematics(ControlLaw):
     def begin(self, facts: LawContext) -> None:
         """Prepares the law of a site before a run, initialising its estimates and their rates.
 
-        The link lengths and the dynamic parameters of the arm are estimated. Their initial
-        values are taken from the settings.
+        The law estimates the link lengths and the dynamic parameters of the arm. The initial
+        estimates are taken from the settings.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -314,7 +314,7 @@ class AdaptiveKinematics(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the conditions under which this law is proved to be stable in an experiment.
+        """Returns the condition under which this law is proved to be stable.
 
         docs/theory/laws-lengths.md proves that the errors e and the velocities qd converge to
         zero. The proof requires constant delays, an irreducible matrix of weights (each arm

@@ -25,18 +25,20 @@ class AdaptiveRobust(AdaptiveBox):
     """Adaptive law with bounded estimates and a robust term -rho r / sqrt(r^2 + width^2).
 
     Here r is the filtered tracking error. The stability result assumes constant delays, no
-    operators, parameters within their bounds, and a disturbance of at most rho at each joint.
-    Under these premises, the power dissipated in V (the energy function of the stability proof)
-    is, averaged over time, at most 0.3003 times the sum of beta_i rho width over the joints of
-    all sites i, where beta_i is the weight of site i in V. No stronger statement is proved. The
-    bound is derived in docs/reference/laws-adaptive.md.
+    operators, true parameters within their bounds, and a disturbance of at most rho at each
+    joint. It bounds the power that is dissipated according to V, the energy function of the
+    stability proof. Averaged over time, this power is at most 0.3003 times the sum of beta_i
+    rho width over the joints of all sites i, where beta_i is the weight of site i in V. It is
+    not proved that the errors converge to zero. The bound is derived in
+    docs/reference/laws-adaptive.md.
 
     Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 
     Attributes:
         Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: As in `AdaptiveBox`.
         rho_nm: Bound on the disturbance per joint, N m (N for a sliding joint).
-        width_rad_s: Value of r at which the robust term is 0.71 rho, per joint, rad/s (m/s).
+        width_rad_s: Value of r at which the robust term is 0.71 rho, per joint, rad/s (m/s for
+            a sliding joint).
         friction: Fraction of the joint friction that the law compensates for.
     """
 
@@ -99,14 +101,14 @@ class AdaptiveRobust(AdaptiveBox):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
-        """Returns the bound on the errors that is proved for this law in a scenario.
+        """Returns the bound on the mean dissipated power that is proved for this law.
 
         The errors do not converge to zero, because friction or an operator may disturb each
-        joint with up to `rho_nm`. Only a bound on their time average is proved. In V, the
-        energy function of the stability proof, site i dissipates a power that consists of
-        beta_i r' Kp r and a term for the disagreement between the sites. r is the filtered
-        error in rad/s, Kp a damping gain in N m s/rad, and beta_i the weight of the site in V.
-        The mean of this power is at most
+        joint with a torque of up to `rho_nm`. Only a bound on a time average is proved. In the
+        stability proof with the energy function V, site i dissipates the power beta_i r' Kp r
+        plus a term for the disagreement between the sites. r is the filtered error in rad/s, Kp
+        a damping gain in N m s/rad, and beta_i the weight of the site in V. The mean of this
+        power is at most
 
             beta_i ROBUST_RESIDUE sum rho width    in W, summed over the joints of the site.
 

@@ -37,7 +37,8 @@ class Authority(ControlLaw):
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping of the arm's motion, per joint, N m s/rad.
-        leads: True if the other arms follow this arm: true for a user, false for the slave.
+        leads: True if the other arms follow this arm: true for the arms of the users, false for
+            the slave.
         gravity: Ratio of the compensated to the true gravity torque. 1 is exact.
     """
 
@@ -54,8 +55,8 @@ class Authority(ControlLaw):
         """Computes the torque of the arm in one tick.
 
         Springs pull the arm towards the arms of the users. Each site sends the flag `leads`,
-        which is 1 for a user and 0 for the slave, and springs pull only towards the arms of
-        sites whose flag is 1.
+        which is 1 for the arm of a user and 0 for the slave. The springs pull only towards arms
+        whose flag is 1.
 
         Args:
             now: Inputs and outputs of the law in this tick. The torque is written into
@@ -83,9 +84,9 @@ class Authority(ControlLaw):
 
             tau = G - d qd + K sum_j alpha_j leads_j (q_j - q)
 
-        The gains describe the first two terms, which have the form of a law known to the
-        analysis (`Law.KNOWN`): G is the gravity compensation, d the damping in N m s/rad and qd
-        the joint velocity. The springs in the sum do not have that form, and are added by
+        The gains describe the first two terms as a special case of the built-in law
+        `Law.KNOWN`: G is the gravity compensation, d the damping in N m s/rad and qd the joint
+        velocity. The springs in the sum are not a special case of that law, and are added by
         `linear_form`.
 
         Args:
@@ -97,7 +98,7 @@ class Authority(ControlLaw):
         return Gains(Law.KNOWN, d=self.d, known=compensated_parameters.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the springs of this law as blocks of the linear analysis.
+        """Returns the springs of this law as matrix blocks for the linear analysis.
 
         Each spring pulls the arm towards the arm of a user:
 
@@ -106,7 +107,7 @@ class Authority(ControlLaw):
         tau is the torque, q the position of the arm, q_j the position sent by peer j, and
         alpha_j its dominance factor. leads_j is 1 if peer j is a user and 0 otherwise.
 
-        A block `form.add(row, column, gain)` adds gain times the column to the row. The row
+        The call `form.add(row, column, gain)` adds gain times the column to the row. The row
         "tau" is the torque, the column "q" the position, the column ("from", j) the vector sent
         by peer j, and the row ("to", j) the vector sent to peer j.
 
@@ -128,16 +129,16 @@ class Authority(ControlLaw):
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:
-        """Explains to the user which dominance factors of a user's arm have no effect.
+        """Explains why a master ignores the dominance factor that it gives to the slave.
 
-        Under the control law of this arm, the users' arms follow only each other. The weight
-        that a scenario assigns to the slave is therefore not used.
+        Under this law, the masters (the arms of the two users) follow only each other. The
+        weight that the scenario assigns to the slave at a master is therefore not used.
 
         Args:
             situation: This arm, and the laws of all arms.
 
         Returns:
-            A sentence for the user. Empty if this arm is the slave, or if there is no slave.
+            A sentence for display. Empty if this arm is the slave, or if there is no slave.
         """
         idle = []
         for name, law in zip(situation.names, situation.laws, strict=True):
@@ -148,11 +149,11 @@ class Authority(ControlLaw):
         return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the gains and delays for which this law is stable at one arm of a scenario.
+        """Evaluates whether the coupling of this arm is stable with the scenario's delays.
 
-        The loop between the two users consists of a spring and a damper, for which a condition
-        is known. No arm follows the slave, so the slave closes no loop and is stable for any
-        delay.
+        The arms of the two users are coupled by springs and braked by dampers. A stability
+        condition is known for such a loop. No arm follows the slave, so the slave closes no
+        loop and is stable for any delay.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.

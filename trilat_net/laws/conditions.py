@@ -47,18 +47,19 @@ class ArmLoad(NamedTuple):
     def list_of_actors(
         actors: Sequence[TorqueSource], joints: int
     ) -> "tuple[ArmLoad, ...] | None":
-        """Returns the spring and the damper of each actor that reacts to the motion of an arm.
+        """Returns the springs and dampers that model the operators and environments of an arm.
 
-        Excludes actors whose torque depends on time alone.
+        Operators and environments whose torque depends on time alone are left out, because
+        they do not react to the motion of the arm.
 
         Args:
             actors: Operators and environments of the arm.
             joints: Number of joints of the arm.
 
         Returns:
-            The springs and dampers. None if the reaction of an actor depends on the pose
-            (because an operator acts on the end effector), or is unknown (for a live operator
-            or a program).
+            The springs and dampers. None if an operator or environment reacts to the motion,
+            but not like a spring and a damper at each joint. Examples are an operator who acts
+            on the end effector, a live operator, and a program.
         """
         loads = []
         for actor in actors:
@@ -89,12 +90,13 @@ class LawSituation(NamedTuple):
             the other sites.
         delay_s: Delay of the link from j to i in row i and column j, at least one tick, s; NaN
             if it varies.
-        tau_limit_nm: Largest torques of the site's joints, N m.
+        tau_limit_nm: Torque limits of the site's joints, N m.
         rate_hz: Tick rate of the site, Hz.
         gravity_nm: Largest gravity torque of the site's planar arm, N m per joint; () for an
             arm from a URDF file.
-        hold_s: Duration for which a torque is held, s: one tick with the scheme `digital`, NaN
-            if tick rates differ between sites, otherwise 0 as in continuous time.
+        hold_s: Duration for which a torque is held constant, s. With the scheme `digital`, this
+            is one tick, or NaN if the sites have different tick rates. With other schemes, it
+            is 0, as in continuous time.
         actors: For each site, the operators and environments of its arm. () if nothing is known
             about any site.
         joints: Number of joints of each arm.
@@ -147,8 +149,9 @@ class LawSituation(NamedTuple):
     def list_loads(self) -> list[tuple[ArmLoad, ...] | None]:
         """Returns the springs and dampers that react to the motion of each arm.
 
-        The entry of an arm is None if an actor reacts to its motion in any other way, see
-        `ArmLoad.list_of_actors`. All entries are None if nothing is known about any actors.
+        The entry of an arm is None if an operator or environment reacts to its motion in any
+        other way, see `ArmLoad.list_of_actors`. All entries are None if the operators and
+        environments are unknown.
         """
         if not self.actors:
             return [None] * len(self.laws)
@@ -158,14 +161,15 @@ class LawSituation(NamedTuple):
     def judge_position_exchange(self, damping: str) -> "StabilityCondition | None":
         """Evaluates whether arms coupled by springs and braked by dampers are stable.
 
-        This control law is called P+d, and its condition holds for arms of any mass. For two
-        arms, the condition is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. For more
-        than two arms, the stiffness K, damping d and delay T must be the same at all arms, and
-        the dominance factors must be reversible, see `DominanceMatrix.find_balancing_weights`
-        (docs/theory/damping-conditions.md, 13).
+        The control law with such a coupling is called P+d. Its stability condition applies to
+        arms of any mass. For two arms, the condition is due to Nuno, Basanez, Ortega and Spong,
+        IJRR 28, 2009. For more than two arms, it requires that the stiffness K, damping d and
+        delay T are the same at all arms, and that the dominance factors are reversible, see
+        `DominanceMatrix.find_balancing_weights` (docs/theory/damping-conditions.md, 13).
 
-        Holding a torque for the period h delays it by h / 2 on average. Therefore d is reduced
-        by K h / 2 and T increased by h / 2, for arms whose smallest inertia exceeds d h / 2
+        Holding a torque for the period h delays it by h / 2 on average. For held torques, the
+        condition is therefore evaluated with d reduced by K h / 2 and T increased by h / 2. It
+        is then known to be sufficient for arms whose smallest inertia exceeds d h / 2
         (docs/reference/laws-springs.md).
 
         Args:
@@ -224,7 +228,7 @@ class LawSituation(NamedTuple):
 
 
 class StabilityCondition(NamedTuple):
-    """States whether, and under which condition, a control law is stable at one arm.
+    """Stability condition of a control law for one arm, and whether the arm satisfies it.
 
     The condition is, for example, a lower bound on the damping.
 
@@ -483,7 +487,7 @@ class LinearForm:
         """Returns the indices of the arms to which the law sends signals, in ascending order.
 
         The linear analysis adds a variable for each of these signals, for example a wave. The
-        list is empty if the law exchanges only the motion.
+        list is empty if the form contains no row ("to", j).
         """
         receivers = set()
         for row, _ in self.blocks:

@@ -101,8 +101,9 @@ class FourChannel(ControlLaw):
     Attributes:
         K: Stiffness per joint, N m/rad.
         B: Damping of the error, per joint, N m s/rad.
-        force_peer: Gain of the peers' torque, C2 or C3, per joint, dimensionless.
-        force_own: Gain of the torque on the arm itself, C6 or C5, per joint, dimensionless.
+        force_peer: Gain of the peers' torque (Lawrence's C2 or C3), per joint, dimensionless.
+        force_own: Gain of the torque on the arm itself (Lawrence's C6 or C5), per joint,
+            dimensionless.
         acceleration: Feedforward gain of the peers' acceleration, dimensionless.
         gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
@@ -121,8 +122,8 @@ class FourChannel(ControlLaw):
     def begin(self, facts: LawContext) -> None:
         """Prepares the law before a run: stores the torque limits and allocates buffers.
 
-        They are needed if the law sends the acceleration of its arm, which it computes from the
-        equation of motion.
+        Both are used to compute the acceleration of the arm from the equation of motion, if the
+        law sends this acceleration to the peers.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -206,7 +207,7 @@ class FourChannel(ControlLaw):
         the acceleration sent by peer j, and alpha_j its dominance factor. `force_own` and
         `acceleration` are gains.
 
-        A block `form.add(row, column, gain)` adds gain times the column to the row. The row
+        The call `form.add(row, column, gain)` adds gain times the column to the row. The row
         "tau" is the torque, the column "tau_h" the torque on the arm, the column ("from", j)
         the vector sent by peer j, and the row ("to", j) the vector sent to peer j.
 
@@ -232,12 +233,12 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Evaluates the stability of this law where the gains alone determine the result.
+        """Evaluates the stability of this law, as far as the gains alone determine it.
 
         If the feedforward gain `acceleration` is 1, high frequencies are undamped, and the
-        condition is not satisfied. In all other cases the condition depends on the arms and is
-        undecided (`holds` is None). For these, the command `trilat ports` evaluates Llewellyn's
-        criterion for absolute stability.
+        condition is not satisfied. In all other cases, stability also depends on the arms, and
+        the condition is undecided (`holds` is None). The command `trilat ports` then evaluates
+        Llewellyn's criterion for absolute stability.
         """
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)

@@ -64,7 +64,7 @@ class Impedance(ControlLaw):
     needs_model: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run: allocates lists for its start pose and acceleration.
+        """Prepares the law before a run: allocates memory for the start pose and acceleration.
 
         The measured pose is stored as the start pose in the first tick.
 
@@ -153,7 +153,7 @@ class Impedance(ControlLaw):
         qd_des (the desired motion) are present only at the slave. The slave sends alpha_j tau_h
         to peer j, where alpha_j is the dominance factor of this peer. The other arms send zero.
 
-        A block `form.add(row, column, gain)` adds gain times the column to the row. The column
+        The call `form.add(row, column, gain)` adds gain times the column to the row. The column
         ("from", j) is the force f_j, and the row ("to", j) the force sent to peer j.
 
         Args:
@@ -200,15 +200,15 @@ class Impedance(ControlLaw):
 
         A loop exists only while the slave touches something and sends forces. By the small-gain
         theorem, the loop is stable for any constant delays if its gain is below 1 at every
-        frequency. A hand at a master changes the gain, and a person may let go at any time, so
-        the gain is computed for every combination of the scenario's hands at the masters, from
-        none to all.
+        frequency. A person who holds a master changes the gain, and may let go at any time. The
+        gain is therefore computed for every combination of the hands that the scenario defines
+        at the masters, from none to all.
 
         The condition is undecided in two cases:
 
-        - A delay varies, in which case the gain at each frequency is not conclusive.
-        - A hand at a master, or the object that the slave touches, is not a spring and a damper
-          per joint.
+        - A delay varies. A gain below 1 at every frequency then does not prove stability.
+        - A hand at a master, or the object that the slave touches, is not modelled as a spring
+          and a damper per joint.
 
         The condition is not satisfied if there is not exactly one slave, if a site uses another
         law, or if a damping coefficient is zero.
@@ -274,9 +274,10 @@ class Impedance(ControlLaw):
         return StabilityCondition(largest_gain < 1.0, text)
 
     def target_motion(self, run: TuningRun) -> Array | None:
-        """Computes the ideal motion of the impedances chosen by the user, with no delay.
+        """Computes how the arms would move if they were ideal impedances without delays.
 
-        The model is driven by the external torques of the run:
+        Each arm is modelled as a mass M on a spring K and a damper B, driven by the external
+        torques of the run:
 
             M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j
 
@@ -508,8 +509,8 @@ def _describe_stiffest_wall(
 def move_impedance(law: Any, force: Array, period_s: float) -> Array:
     """Computes the motion of a mass M on a spring K and a damper B under a given force.
 
-    The mass starts at position 0, at rest. The force is held constant over each period, for
-    which the solution is exact.
+    The mass starts at position 0, at rest. The solution is exact for a force that is constant
+    over each period.
 
     Args:
         law: Settings of the law, which contain M, B and K.

@@ -144,18 +144,19 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def tag(self) -> str:
-        """Name with which a scenario selects the law, for example "p_d"."""
+        """Name by which a scenario selects the law, for example "p_d"."""
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Raises ScenarioError if gains are contradictory or the number of arms is unsuitable.
+        """Raises ScenarioError if gains contradict each other or the number of arms is wrong.
 
         Args:
             path: Path of the law's table in the scenario, for error messages.
             sites: Number of sites in the scenario.
 
         Raises:
-            ScenarioError: A gain or the number of sites is invalid. The error names the key.
+            ScenarioError: A gain or the number of sites is invalid. The message contains the
+                key.
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
@@ -302,8 +303,8 @@ class LawSettings(Frozen, frozen=True):
     def build_channel(self, layout: Layout, peers: int) -> LawChannel:
         """Returns the vectors that the law sends from a site, with their lengths.
 
-        A law declares the vectors without knowing the arm. Their lengths follow from the
-        numbers of joints and coordinates.
+        The class of a law declares the vectors independently of any arm. Their lengths follow
+        from the numbers of joints and coordinates.
 
         Args:
             layout: Numbers of the site's joints and coordinates.
@@ -320,11 +321,11 @@ class LawSettings(Frozen, frozen=True):
         return LawChannel(tuple(common_first), peers)
 
     def find_uniform_spring(self) -> tuple[float, float] | None:
-        """Returns the gains of a law that is only a spring and a damper, equal at all joints.
+        """Returns the gains of this law, if it is only a spring and a damper.
 
         Returns:
-            Stiffness K in N m/rad and damping d in N m s/rad. None for any other law, and for
-            gains that differ between joints.
+            Stiffness K in N m/rad and damping d in N m s/rad, which are the same for all
+            joints. None for any other law, and for gains that differ between joints.
         """
         return None
 
@@ -440,7 +441,7 @@ class ControlLaw:
         remembers: Names of the instance attributes that keep the state of the law between
             ticks.
         tune: Mapping from the name of each tunable gain to its range.
-        known_facts: Sentence for the user that states which facts about the arm the law needs.
+        known_facts: Phrase for the user that states which facts about the arm the law needs.
     """
 
     Settings: ClassVar[type[LawSettings]] = LawSettings
@@ -528,7 +529,7 @@ class ControlLaw:
 class EnergyLaw(ControlLaw):
     """Base class of the laws that keep an account of the energy exchanged between the arms.
 
-    One site counts the energy that it sends, and another site the energy that it uses, so all
+    The sender counts the energy that it sends, and the receiver the energy that it uses, so all
     sites must use the same law. These laws require the integration scheme `digital`, which
     holds each torque constant for one control period. Only then is the work of a torque known
     exactly: the torque times the motion of the joint.

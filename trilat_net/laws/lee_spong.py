@@ -101,7 +101,7 @@ class LeeSpong(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the gains and delays for which this law is stable at one arm of a scenario.
+        """Evaluates whether the coupling of this arm is stable with the scenario's delays.
 
         Uses the known condition for a spring with a damper, which requires the damping to
         exceed the stiffness times the delay.

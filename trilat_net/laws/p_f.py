@@ -133,7 +133,7 @@ class PF(ControlLaw):
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Explains to the user why force reflection cannot couple the arms of an experiment.
+        """Explains to the user why force reflection cannot couple the arms of a scenario.
 
         This law requires exactly one master and one slave.
 

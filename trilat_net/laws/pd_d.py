@@ -24,8 +24,8 @@ class PdD(ControlLaw):
 
     G(q) is the gravity torque. The error e is the position minus the reference (the mean
     position of the peers, weighted by the dominance factors), and ed is its derivative. For
-    constant delays and equal ratios Kd / K at all sites, the condition of P+d on K and d is
-    sufficient.
+    constant delays and equal ratios Kd / K at all sites, the stability condition of the law
+    `PD` on K and d is also sufficient for this law.
 
     Attributes:
         K: Stiffness per joint, N m/rad.

@@ -21,7 +21,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 @compiled
 class SaturatedPd(ControlLaw):
-    """Couples arms with springs that saturate, and brakes each arm.
+    """Couples arms with springs that saturate, and brakes each arm with a damper.
 
         tau = G - sum_j alpha_ij P tanh(K (q - q_j) / P) - d qd
 
@@ -30,7 +30,7 @@ class SaturatedPd(ControlLaw):
 
     Attributes:
         K: Stiffness for small errors, per joint, N m/rad.
-        P: Largest pull of all peers together, per joint, N m.
+        P: Largest spring torque towards all peers together, per joint, N m.
         d: Damping of the arm's motion, per joint, N m s/rad.
         gravity: Ratio of the compensated to the true gravity torque; 1 is exact.
     """
@@ -99,15 +99,15 @@ class SaturatedPd(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates the stability of this law, and whether its torques stay within limits.
 
-        The condition for a linear spring of stiffness K with a damper applies at any resting
-        pose, even if sites are held apart. This does not follow merely from the fact that the
-        spring is nowhere stiffer than K. The proof uses the fact that the slopes of the
-        hyperbolic tangents form a positive semidefinite matrix, and applies the Schur product
-        theorem (docs/theory/damping-conditions.md, 13).
+        The stability condition for a linear spring of stiffness K with a damper also applies to
+        this law, at any resting pose, even if the arms are held apart. That the spring is
+        nowhere stiffer than K would not suffice to prove this. The proof uses the fact that the
+        slopes of the hyperbolic tangents form a positive semidefinite matrix, and applies the
+        Schur product theorem (docs/theory/damping-conditions.md, 13).
 
         If the gravity torque of the arm is known, the torque limit of each joint must exceed
         the sum of the gravity torque and the largest spring torque P. The text of the condition
-        then states the joint speed up to which the damper stays within the remaining torque.
+        then states the joint speed up to which the remaining torque suffices for the damper.
 
         Args:
             situation: The site, its peers, its torque limits and the delays.

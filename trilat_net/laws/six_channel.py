@@ -46,7 +46,7 @@ class SixChannel(FourChannel):
             If the dominance factors are not consistent with a single factor, a condition that
             is not satisfied. Otherwise the condition of the four-channel law, which may be
             undecided. Its text begins with the value of a and the weights beta with which the
-            operators' torques add up to zero at rest.
+            external torques on the arms add up to zero at rest.
         """
         if len(situation.alpha) != 3:
             return StabilityCondition(False, "this law is for two users and a slave")
@@ -71,7 +71,7 @@ class SixChannel(FourChannel):
 
 
 def complementary_weights(a: float) -> tuple[float, float, float]:
-    """Computes the weights beta with which the operators' torques add up to zero at rest.
+    """Computes the weights beta with which the external torques add up to zero at rest.
 
     While all arms rest, sum_i beta_i tau_i = 0, where tau_i is the external torque on arm i, in
     N m.

@@ -37,9 +37,10 @@ from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
 class Smith(ControlLaw):
     """Couples a master and a slave with springs and a predictor that removes the delay.
 
-    A spring pulls each arm towards the other, and a damper brakes it. Instead of waiting for
-    the delayed position of the slave, the master uses a model of the slave and corrects it with
-    the delayed deviation from the true motion. The equations are given in the module docstring.
+    A damper brakes each arm. The slave is pulled towards the delayed position of the master.
+    The master is pulled towards the position of an undelayed model of the slave, corrected by
+    the delayed difference between the slave and the model. The equations are given in the
+    module docstring.
 
     Source: Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53,
     1957 (cited from memory).
@@ -168,10 +169,10 @@ class Smith(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the predictor removes the delay from the control loop.
 
-        Exactly one of the two arms must predict, and K, d and inertia must be equal at both
-        arms. Otherwise the condition is not satisfied. If both requirements are satisfied, the
-        condition is undecided (`holds` is None): the loop is stable while the slave moves
-        freely, but the model does not include contacts.
+        The setting `predicts` must be true at exactly one of the two arms, and K, d and inertia
+        must be equal at both arms. Otherwise the condition is not satisfied. If both
+        requirements are satisfied, the condition is undecided (`holds` is None): the loop is
+        stable while the slave moves freely, but the model does not include contacts.
 
         Args:
             situation: The two arms and their laws.

@@ -28,7 +28,7 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ControlLaw, TuningRun, 
 
 @compiled
 class Sync(ControlLaw):
-    """Synchronises the outputs r = qd + Lambda q of all arms, and learns the arm's parameters.
+    """Synchronises the outputs r = qd + Lambda q of all arms, and learns their parameters.
 
         tau = Y theta_hat + K (sum_j alpha_ij r_j - r)
         rate of theta_hat = -Gamma Y' r
@@ -38,7 +38,8 @@ class Sync(ControlLaw):
     parameters. The matrix Y(q, qd, -Lambda q, -Lambda qd) is the regressor: its product with
     the parameters is the torque of the arm's dynamics. Y' is its transpose.
 
-    Weakness: under gravity, all arms end at q = 0 or hanging. Only planar arms are supported.
+    Weakness: under gravity, all arms come to rest at q = 0 or hanging down. Only planar arms
+    are supported.
 
     Source: Chopra, Spong and Lozano, "Synchronization of bilateral teleoperators with time
     delay", Automatica 44, 2008; the weakness is described by Nuno, Ortega and Basanez,
@@ -64,8 +65,9 @@ class Sync(ControlLaw):
     def begin(self, facts: LawContext) -> None:
         """Prepares the law before a run by creating the parameter estimate.
 
-        The initial estimate of the arm's dynamic parameters is the setting `theta_hat0`. Its
-        rate in the previous tick is also stored, as required by the trapezoid rule.
+        The initial estimate of the arm's dynamic parameters is the setting `theta_hat0`. Space
+        is also reserved for the product Y' r of the previous tick, which determines the rate of
+        the estimate and is required by the trapezoid rule.
 
         Args:
             facts: Facts about the arm and the other arms that are known before the run.
@@ -158,7 +160,8 @@ class Sync(ControlLaw):
 
         The stability proof requires constant delays. If a delay varies, the condition is
         undecided (`holds` is None). If all delays are constant, the text also warns that under
-        gravity the arms end only at poses with Y_G' r = 0.
+        gravity the arms come to rest only at poses with Y_G' r = 0, where r is the output of
+        the arm, and the matrix Y_G times the parameters is the gravity torque.
 
         Args:
             situation: This arm, the other arms, their laws, and the delays between them.
@@ -177,8 +180,9 @@ class Sync(ControlLaw):
     def target_motion(self, run: TuningRun) -> Array | None:
         """Computes the mean motion of the arms, which is the goal of the tuning for this law.
 
-        The law only makes the outputs r of all arms equal. Under gravity, the arms do not come
-        to rest at the pose to which the operators pull them.
+        The law only makes the outputs r = qd + Lambda q of all arms equal. Under gravity, the
+        arms do not come to rest at the pose to which the operators pull them, so the gains are
+        not tuned for that pose.
 
         Args:
             run: The motion of all arms in a tuning run.

@@ -204,7 +204,7 @@ class Tanks(EnergyLaw):
         environments are passive.
 
         Args:
-            situation: This arm, including its tick rate.
+            situation: This arm and its tick rate.
         """
         part_per_tick = self.packet_1_s / situation.rate_hz
         if part_per_tick > 1.0:

@@ -869,9 +869,9 @@ class Tdpa(EnergyLaw):
         """Computes the energies that show whether the law was passive in a run.
 
         For each peer, the result contains the energy that this arm put into the two couplings
-        with this peer, the energy that it extracted, and the energy that it observed. The
-        result also contains the energy of the springs and the energy that the arm supplied to
-        its controller.
+        with this peer, the energy that it extracted, and the energy that, by its own account,
+        it may still extract. The result also contains the energy of the springs and the energy
+        that the arm supplied to its controller.
 
         The energies of the follower lag by one tick, because the work of a control period is
         known only at its end.
@@ -932,13 +932,13 @@ class Tdpa(EnergyLaw):
 
         Passive means that the law never supplies more energy than it received. The law has this
         property for all gains, delays, lost messages and dominance factors, so the condition is
-        always satisfied. Only the assumptions differ:
+        always satisfied. The assumptions depend on how the law computes work:
 
-        - With `energy` = "step", work is torque times motion, which is exact. However, energy
-          is paid in advance for each control period, based on the predicted motion. If another
-          torque changes the acceleration, the prediction is wrong. Changes of up to
-          `acceleration_rad_s2` are allowed for, and half of `reserve_J` covers the difference
-          beyond that.
+        - With `energy` = "step", work is torque times motion, which is exact. However, the work
+          of each control period is charged in advance, based on the predicted motion. If
+          another torque changes the acceleration, the prediction is wrong. Changes of up to
+          `acceleration_rad_s2` are allowed for, and half of `reserve_J` must cover the energy
+          of larger changes.
         - With `energy` = "velocity", as in the original publication, work is torque times
           velocity times the control period h. This neglects the acceleration qdd within a
           period, and therefore work of up to tau qdd h^2 / 2, where tau is the torque.

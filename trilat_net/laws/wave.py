@@ -492,10 +492,10 @@ class Wave(EnergyLaw):
     tune: ClassVar = {"b": DAMPING, "K": STIFFNESS}
 
     def begin(self, facts: LawContext) -> None:
-        """Prepares the law before a run by creating its lines, which carry no waves yet.
+        """Prepares the law before a run by creating the virtual lines to the peers.
 
-        Lists with one entry per line and joint are flat: joint i of peer j has the index j n +
-        i, where n is the number of joints.
+        The lines carry no waves yet. Lists with one entry per line and joint are flat: joint i
+        of peer j has the index j n + i, where n is the number of joints.
 
         Waves are in sqrt(W): a wave w carries the power w^2 / 2.
 
@@ -549,7 +549,8 @@ class Wave(EnergyLaw):
     def torque(self, now: LawInput) -> None:
         """Computes the torque of one tick, and sends waves to the other arms.
 
-        The torque is the sum of the torques exerted by all arriving waves. The steps are:
+        The torque is the sum of the gravity compensation and the torques exerted by all
+        arriving waves. The steps are:
 
         1. Update the energy account of each joint with the work of the previous control period.
         2. Send the waves of joints without a spring.
@@ -639,8 +640,9 @@ class Wave(EnergyLaw):
         - "carried": the part of the torque that compensates for gravity, N m. It is subtracted
           from the torque, because its work is unrelated to the waves.
 
-        The gain beta divides the torque of the waves. In terms of wave energy, the work of the
-        arm is therefore larger by the factor beta.
+        The torque of the waves is divided by the gain beta before it acts on the arm. The work
+        of this torque is therefore multiplied by beta before it is compared with the energy of
+        the waves.
 
         Args:
             seen: Records of the site in the run.
@@ -648,7 +650,7 @@ class Wave(EnergyLaw):
         Returns:
             The energy sent to each peer (`gave`), the energy used from the peer's waves
             (`took`), the energy that the arm supplied to its controller (`port`), H (`store`),
-            the dissipated energy (`taken`), and W, which the site itself observed (`observed`).
+            the dissipated energy (`taken`), and W (`observed`).
         """
         sent_energies = []
         used_energies = []
@@ -820,8 +822,8 @@ class Wave(EnergyLaw):
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the torque and the sent waves as linear functions of motion and waves.
 
-        The linear analysis uses them for small motions about a resting pose. A line is treated
-        as a pure delay in continuous time, with no late or lost waves.
+        The linear analysis uses these functions for small motions about a resting pose. A line
+        is treated as a pure delay in continuous time, with no late or lost waves.
 
         Args:
             situation: The site, its arm and the other sites.
@@ -871,9 +873,9 @@ class Wave(EnergyLaw):
             tau  = F / beta
             u    = v - (c / b) F
 
-        Each is linear in the four columns v, q_sd, q and qd. A block `form.add(row, column,
-        gain)` adds gain times the column to the row. The row of a state is its rate; ("from",
-        j) is the wave received from peer j, and ("to", j) the wave sent to it.
+        All four are linear in v, q_sd, q and qd. The call `form.add(row, column, gain)` adds
+        gain times the column to the row. The row of a state is its rate; ("from", j) is the
+        wave received from peer j, and ("to", j) the wave sent to it.
 
         Args:
             form: The law's linear form; modified.

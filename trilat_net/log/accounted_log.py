@@ -24,11 +24,11 @@ from .session_accounts import SessionAccounts
 
 
 class LogQuality(NamedTuple):
-    """How much of a run a log shows, and whether the log can be trusted.
+    """How much of a run was recorded, and whether its log can be trusted.
 
     Attributes:
         coverage: Numbers of recorded and expected ticks of every site.
-        integrity: Whether the log is unmodified since it was written.
+        integrity: Whether the log was modified after it was written.
         copied_sites: Sites that did not react to the other sites, because the run is a
             repetition in which their motion was copied from an earlier run.
     """
@@ -39,7 +39,7 @@ class LogQuality(NamedTuple):
 
 
 class AccountedLog(DecodedLog):
-    """The messages of a session, and which of them are missing.
+    """The recorded messages of a session, and which messages are missing.
 
     See `Log`, the public class, for the arguments and attributes.
     """
@@ -128,7 +128,7 @@ class AccountedLog(DecodedLog):
     def account(self, site: str) -> str:
         """Returns the recorder's counts of received and missing records for a site.
 
-        They may disagree with the contents of a damaged file.
+        The counts may disagree with the contents of a damaged file.
 
         Args:
             site: Name of the site.
@@ -201,7 +201,7 @@ class AccountedLog(DecodedLog):
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Lists the starts of each site that joined after the session had begun.
+        """Lists the late starts of each site that joined late or was restarted.
 
         Each start is given by its first tick and the random number (boot) that identifies this
         start of the process. Sites that were present from the beginning and never restarted
@@ -221,9 +221,9 @@ class AccountedLog(DecodedLog):
 
         This happens when a process is killed and restarted, or joins a session late. Each start
         in `starts` is preceded by a range (first tick, last tick) of such ticks. The range
-        begins after the last earlier tick that is known to have been executed, from a record,
-        from the "end" event of the earlier process, or because another site received the sample
-        sent in that tick.
+        begins after the last earlier tick that the site is known to have executed. A tick is
+        known to have been executed if there is a record of it, if the "end" event of the
+        earlier process includes it, or if another site received the sample sent in that tick.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 

@@ -164,7 +164,7 @@ class Account:
         refilled: Number of messages that were missing at first and that the sender then sent
             again from its memory.
         unpublished: Number of messages that were never published, because the sender skipped
-            them, or was killed before it reached them and continued after them when restarted.
+            their numbers, or was killed and continued with higher numbers when restarted.
         last: Highest message number known to exist; -1 before the first message.
         silence_ns: Longest time between two consecutive arrivals, in ns; 0 if no arrival times
             are known.
@@ -258,8 +258,8 @@ class Account:
     def add_expected(self, published: int) -> None:
         """Records that the sender has published at least the messages 0 to `published` - 1.
 
-        Those that have not arrived count as missing from now on. Messages lost at the end would
-        otherwise go unnoticed, because no later number reveals the gap.
+        The messages among them that have not arrived count as missing from now on. Messages
+        lost at the end would otherwise go unnoticed, because no later number reveals the gap.
         """
         if published > self.last + 1:
             self._gaps.insert(self.last + 1, published - 1)
@@ -268,15 +268,16 @@ class Account:
     def mark_unpublished(self, first: int, published: int = 0) -> int:
         """Reclassifies the missing numbers just below `first` as never published.
 
-        This applies when the sender skips numbers, or is killed and restarted. Of the range of
-        missing numbers that ends just below `first`, those at or above `published` count as
-        unpublished instead of missing.
+        This applies when the sender skips numbers, or is killed and restarted. In the range of
+        missing numbers that ends just below `first`, the numbers at or above `published` count
+        as unpublished instead of missing.
 
         Args:
-            first: Number of the first message after the gap, that is, the first one published
-                after the restart or after the skipped numbers.
-            published: Number of messages known to have been published before the gap. Their
-                numbers are below `published`, and they stay missing if they were not received.
+            first: Number of the first message that was published after the restart or after the
+                skipped numbers.
+            published: Number of messages that the sender is known to have published before it
+                was restarted or skipped numbers. These messages have the numbers below
+                `published`, and stay missing if they were not received.
 
         Returns:
             The lowest number that now counts as unpublished, or `first` if there is none.
@@ -334,7 +335,7 @@ class Account:
     def expected(self) -> int:
         """Number of messages that the sender has published, as far as the receiver knows.
 
-        Numbers that never had a message (`unpublished`) are excluded.
+        Numbers of messages that were never published (`unpublished`) are excluded.
         """
         return self.last + 1 - self.unpublished
 
@@ -365,7 +366,7 @@ class Account:
         """Summarises the account in one line, as a log stores it for each channel.
 
         The line states the expected, received and missing counts and the first ranges of
-        missing numbers. `parse_counts` can read it back.
+        missing numbers. `parse_counts` reads the received and missing counts from the line.
 
         Args:
             *before: Accounts of earlier starts of the sender, each of which numbered its
@@ -440,14 +441,14 @@ class Account:
 
 
 class StartGap:
-    """Gap between the messages of two starts of a site, in one channel.
+    """Gap in the message numbers of one channel, left by a site that was killed and restarted.
 
     A site that is killed cannot state how many messages it published, and when restarted it
     continues at a later tick. The messages in between were either published and lost on the way
-    to the recorder, or never published. Other sites that received samples of the earlier start
-    know a lower bound on the number of messages it published, and may report that bound before
-    or after the restart. A few messages may still have been in transit to the recorder when the
-    site was killed. These count as unpublished.
+    to the recorder, or never published. The samples that other sites received give a lower
+    bound on the number of messages that the killed site published. The other sites may report
+    this bound before or after the restart. A few messages may still have been in transit to the
+    recorder when the site was killed. These messages count as unpublished.
 
     The gap is divided at the number `_first_unpublished`, which never decreases:
 
@@ -489,8 +490,8 @@ class StartGap:
 
         Args:
             first: Number of the first message of the next start.
-            published: Number of messages that the earlier start stated when it ended; 0 if the
-                site was killed before it could state the number.
+            published: Number of messages published by the earlier process of the site, as
+                stated when it ended; 0 if it was killed before it could state the number.
         """
         is_evaluated = self._next_first >= 0
         if is_evaluated:
@@ -503,10 +504,10 @@ class StartGap:
     def note_published(self, published: int) -> None:
         """Updates the gap after a report of how many messages the killed site had published.
 
-        Other sites send these reports, because they received samples of the killed site. The
-        missing messages before the next start first count as unpublished, since they may have
-        been in transit when the site was killed. If a report shows that more messages were lost
-        than can have been in transit, all of them (from `_first_unpublished` up to, but
+        Other sites that received samples of the killed site send these reports. The missing
+        messages before the next start first count as unpublished, since they may have been in
+        transit when the site was killed. If a report shows that more messages were lost than
+        can have been in transit, all of these messages (from `_first_unpublished` up to, but
         excluding, the reported number) count as missing instead.
 
         Before the next start is known, the report is only stored for `begin_next_start` to
@@ -529,10 +530,10 @@ class StartGap:
 
 
 def describe_unknown_ends(sites: Sequence[str]) -> str:
-    """Returns a sentence that warns the user about sites whose end is unknown.
+    """Returns a warning for the user about sites whose shutdown was not recorded.
 
-    A site publishes an "end" event when it ends. Without this event, it is unknown whether the
-    site published any more records after the last one received.
+    A site publishes an "end" event when it shuts down. Without this event, it is unknown
+    whether the site published any more records after the last one received.
 
     Args:
         sites: Names of the sites whose "end" event was not received, at least one.
@@ -553,7 +554,7 @@ class Coverage(NamedTuple):
     Attributes:
         judged: Maps the name of each site to the number of its ticks that were recorded or
             checked.
-        expected: Maps the name of each site to the number of all its ticks in the run.
+        expected: Maps the name of each site to the total number of its ticks in the run.
     """
 
     judged: dict[str, int]
@@ -624,8 +625,8 @@ peer was restarted.
 def count_skipped_ticks(texts: Sequence[str]) -> int:
     """Returns how many ticks a site skipped just before a record.
 
-    A site skips ticks when its control loop falls behind. A record contains the changes applied
-    in its tick, including those that report skipped ticks.
+    A site skips ticks when its control loop falls behind. It reports the number of skipped
+    ticks as a change in its next record, among the other changes of that tick.
 
     Args:
         texts: Changes in the record, as JSON strings. Invalid strings are ignored.

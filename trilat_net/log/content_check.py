@@ -194,7 +194,7 @@ class ContentCheck:
     def identify(self, payload: bytes) -> str:
         """Determines the topic of a message from its content.
 
-        A recovery needs this for messages whose channel is damaged.
+        A recovery uses this for messages whose channel has no trustworthy definition.
 
         Args:
             payload: Bytes of the message.

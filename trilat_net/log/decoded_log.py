@@ -168,8 +168,8 @@ class DecodedLog(Mapping[str, SiteLog]):
     def timed_events(self) -> TimedMessages[Event]:
         """Returns the events of all processes of the session, in order of arrival.
 
-        An event is a notable occurrence, such as a lost connection. Each is returned with the
-        time it was sent and the time it arrived at the recorder.
+        An event is a notable occurrence, such as a lost connection. Each event is returned with
+        the time at which it was sent and the time at which it arrived at the recorder.
         """
         events: list[Event] = []
         log_times = [np.zeros(0, np.int64)]

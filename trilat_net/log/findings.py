@@ -43,10 +43,10 @@ class Finding:
     Holds the problems that the check found.
 
     Attributes:
-        check: Name of the check. Every file is checked for "whole", "checksums", "records" and
-            "index", and a log of trilat-net also for "sequence", "accounts", "chain", "schema",
-            "times", "rates" and "scenario". When a run is repeated and compared, the name is
-            the subject of the comparison.
+        check: Name of the check. The checks of every file are "whole", "checksums", "records"
+            and "index". Further checks of a log of trilat-net are "sequence", "accounts",
+            "chain", "schema", "times", "rates" and "scenario". When a run is repeated and
+            compared, the name states what is compared.
         text: The result in one line.
         passed: True if the check passed.
         judged: True if the check could be carried out. False if it would have run third-party
@@ -118,8 +118,8 @@ class Finding:
 class Findings(dict[str, Finding]):
     """Mapping from the name of a check of a log to its result, in order of first use.
 
-    Reading a name that does not exist yet creates a result with no problems, so any code can
-    add a problem with `findings["records"].add(...)`.
+    Looking up a name for the first time creates a result with no problems, so any code can add
+    a problem with `findings["records"].add(...)`.
     """
 
     def __missing__(self, check: str) -> Finding:

@@ -98,7 +98,7 @@ class ChannelMessages:
         return self._data
 
     def add(self, payload: bytes, log_ns: int, publish_ns: int) -> None:
-        """Appends a message to those of the topic.
+        """Appends a message to the messages of the topic.
 
         Messages must be added in file order.
 
@@ -116,7 +116,7 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def add_block(self, block: MessageBlock) -> None:
-        """Appends a block of messages to those of the topic. Blocks must come in file order."""
+        """Appends a block of messages of the topic. Blocks must be added in file order."""
         data = self._reserve(block.most_bytes)
         ends, (log_ns, publish_ns) = block.copy_payloads(data, self._size)
         self._size = int(ends[-1])

@@ -105,8 +105,8 @@ class ChannelFilter:
         `ChannelFilter.parse_facts` converts them back to a filter.
 
         Returns:
-            The key expressions, separated by spaces, under "include" and "exclude". A key
-            without expressions is omitted.
+            A mapping with the entries "include" and "exclude", which contain the key
+            expressions, separated by spaces. An entry without key expressions is omitted.
         """
         texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
         return {name: text for name, text in texts.items() if text}

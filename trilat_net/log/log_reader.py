@@ -55,7 +55,7 @@ class Log(Result, AccountedLog):
 
     Attributes:
         source: Name of the file. For several files, the name of the first and their number.
-        sources: Names of the files, in message order.
+        sources: Names of the files, in the order of their messages.
         session: Metadata of the session: driver, seed, start time, versions, commit,
             fingerprint.
         driver: How the session ran: "live", "virtual" (simulated time) or "rerun".
@@ -125,7 +125,7 @@ class Log(Result, AccountedLog):
         return "" if has_records else "no site has a record in this log"
 
     def require_records(self) -> None:
-        """Raises LogError if the log contains no records, as there is then nothing to judge.
+        """Raises LogError if the log contains no records, so that nothing can be evaluated.
 
         Raises:
             LogError: No site has a record.
@@ -149,7 +149,7 @@ class Log(Result, AccountedLog):
         return text
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns a summary of the session, with the keys of `trilat sim --json`.
+        """Returns a summary of the session, with the same keys as `trilat sim --json`.
 
         The entry "sites" maps the name of each site to its summary figures. The records
         themselves are not included.
@@ -305,7 +305,7 @@ class Log(Result, AccountedLog):
     def warn_of_failures(self) -> None:
         """Issues Python warnings if an arm diverged, or if a program that moves an arm failed.
 
-        The warnings point to the line that called the caller of this method.
+        Python reports the warnings for the line of code that called the caller of this method.
         """
         for failure in self.failed_hands:
             warnings.warn(failure, RuntimeWarning, stacklevel=3)
@@ -360,13 +360,14 @@ class Log(Result, AccountedLog):
     def link_delays(self) -> dict[str, list[TracePoint]]:
         """Maps the name of each link, such as "m1->s", to the measured delays of its samples.
 
-        Each delay is a pair (stamp in s, delay in ms), sorted by stamp. The stamp of a sample
-        is the nominal time of the tick in which the sender computed it. The receiver stores the
-        network delay of each sample in the field `rx` of its records. Delays injected by the
-        scenario are not included. A negative delay results from clock errors and counts as 0.
-        If a sample arrived twice, the shorter delay counts. A sample counts as sent if the
-        sender has a record of its tick. A lost sample has an infinite delay. The list is empty
-        if no sample arrived over the link.
+        The delays of a link are a list of pairs (stamp in s, delay in ms), sorted by stamp. The
+        stamp of a sample is the nominal time of the tick in which the sender computed it. The
+        receiver stores the network delay of each sample in the field `rx` of its records.
+        Delays injected by the scenario are not included. A negative delay results from clock
+        errors and counts as 0. If a sample arrived twice, the shorter delay counts. A sample
+        counts as sent if the log contains the sender's record of its tick. If such a sample
+        never arrived, its delay is infinite. The list is empty if no sample arrived over the
+        link.
         """
         delays = {}
         for site in self.sites:

@@ -234,10 +234,10 @@ class LogWriter:
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound on the size of the file if it were finished now, in bytes.
+        """Upper bound on the size of the finished file without its message counts, in bytes.
 
-        Used to decide whether another message still fits into a part of limited size. The
-        message counts, which `finish` also writes, are not included.
+        The bound applies if the file is finished now. It is used to decide whether another
+        message still fits into a part of limited size.
         """
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views

@@ -75,10 +75,10 @@ class FileCheck:
         self._has_unreadable = False
 
     def check_record(self, record: mcap_records.ScannedRecord) -> None:
-        """Checks one record of the file, and stores how the index must refer to it.
+        """Checks one record of the file, and stores the entry that the index must have for it.
 
-        The index is at the end of the file, so the comparison follows when the whole file has
-        been read. Problems are added to the findings.
+        The index is at the end of the file, so the stored entries are compared with it when the
+        whole file has been read. Problems are added to the findings.
 
         Args:
             record: The record.

@@ -143,8 +143,8 @@ class ChunkHead(NamedTuple):
 def unpack_chunk(content: bytes) -> bytes:
     """Decompresses the records of a chunk, and checks them against its header.
 
-    Since the header may be wrong, at most the stated size is decompressed, and only within
-    reasonable limits.
+    The size stated in the header may be wrong. A size beyond reasonable limits is rejected, and
+    data that decompress to another size are rejected too.
 
     Args:
         content: Content of the chunk, consisting of its header and the compressed records.
@@ -303,7 +303,7 @@ class ScannedRecord:
 
     @property
     def content(self) -> bytes:
-        """Content of the record in bytes, without the opcode and the length field.
+        """Bytes of the record's content, without the opcode and the length field.
 
         Read from the file on first access, so that scanning a large file is fast.
         """
@@ -343,8 +343,7 @@ class ScannedRecord:
 class RecordScanner:
     """Finds the records of an MCAP file one after another, skipping damaged parts.
 
-    Every program that checks, recovers or verifies a file reads the records through this
-    scanner.
+    All code that checks or recovers a file finds its records with this scanner.
 
     Args:
         stream: The file, opened for reading. The file begins at the current position of the

@@ -103,9 +103,9 @@ class MessageIdentity(NamedTuple):
 def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
     """Computes the boot of a site in a run in virtual time.
 
-    The boot identifies one start of a site. In live sessions it is a random number. In virtual
-    time it is derived from the scenario, so that runs are reproducible and every message of a
-    run identifies its scenario.
+    The boot is a number that identifies one start of a site's process. In live sessions, it is
+    random. In virtual time, it is derived from the scenario, so that runs are reproducible and
+    every message of a run identifies its scenario.
 
     Args:
         scenario_sha256: SHA-256 hash of the scenario, in hexadecimal digits.

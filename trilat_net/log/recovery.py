@@ -111,7 +111,7 @@ class Recovery(Result):
     def lossless(self) -> bool:
         """True if the recovered file contains everything that the damaged file contains.
 
-        False if some bytes could not be read or assigned, in which case `lost` describes them.
+        False if anything was lost, in which case `lost` describes the losses.
         """
         return not self.lost
 

@@ -325,9 +325,10 @@ class RecoverySurvey:
         def is_genuine(definition: Definition) -> bool:
             """Returns True if a definition may belong to the session of the messages.
 
-            This holds for all definitions that are covered by a checksum. Any other definition
-            is foreign if it names the rejected session, and if in addition it lies in a page
-            with foreign metadata or the messages belong to a session of another name.
+            This holds for every definition that is covered by a checksum, and for every
+            definition that does not name the foreign session. It holds for any other definition
+            only if both sessions may have the same name and the definition is not in a page
+            with foreign metadata.
             """
             offset = self._uncovered_offsets.get(definition)
             if offset is None:  # a checksum covers the definition

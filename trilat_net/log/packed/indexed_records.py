@@ -151,7 +151,7 @@ class IndexedRecords:
 
     @property
     def used(self) -> Ints:
-        """Tick of the sample of each peer that the control law used in each record.
+        """Ticks of the peers' samples that the control law used, for each of the K records.
 
         Shape (K, P) for P peers. The tick is -1 before the first sample of a peer.
         """

@@ -108,10 +108,10 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
     @classmethod
     def of_log(cls, log: "Log") -> "Ros2Topics":
-        """Lists the topics that a bridge would use to publish the session of a log live.
+        """Lists the topics that the ROS 2 bridge would use to publish the session of a log.
 
-        Files for viewers then work for the log and for the live session alike. The names follow
-        the first of the built-in conventions.
+        Viewer settings that are created from a log contain these topics, so that they also work
+        for the live session. The names follow the first built-in convention (`NAMINGS`).
 
         Args:
             log: Log of the session.
@@ -151,7 +151,7 @@ class Ros2Topics(dict[str, Ros2Channel]):
 
     @property
     def are_of_log(self) -> bool:
-        """True if the topics are those of a log (for viewers) rather than those of a bag.
+        """True if the topics come from a log with messages for viewers, not from a bag.
 
         False for a file without topics.
         """
