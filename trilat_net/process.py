@@ -41,7 +41,7 @@ def pause_gc() -> Iterator[None]:
 
 
 def freeze_gc() -> None:
-    """Speeds up later garbage collections by exempting all existing objects.
+    """Speeds up later garbage collections by exempting all existing objects from them.
 
     A collection is run first. Without this function, each full collection traverses all objects
     of the imported modules, which takes a quarter of a second.

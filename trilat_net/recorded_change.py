@@ -34,13 +34,13 @@ class RecordedChange(
 ):
     """A change during a run as recorded in a log, for example a new network delay.
 
-    The change applies to a link, to the dominance factors of a site, or is a command for a
-    site. Exactly one of `link`, `dominance` and `site` is not empty. The values are not
-    validated; `change.Change` is the validated form.
+    The change concerns a link or the dominance factors of a site, or is a command to a site.
+    Exactly one of `link`, `dominance` and `site` is not empty. The values are not validated;
+    `change.Change` is the validated form.
 
     Attributes:
-        at_s: Time at which the change takes effect, in s since the start of the session. A link
-            changes for samples sent at this time or later.
+        at_s: Time at which the change takes effect, in s since the start of the session. A
+            change of a link affects samples that are sent at this time or later.
         link: Name of the link that changes, for example "m1->s".
         dominance: Name of the site whose dominance factors change.
         to: State after the change: all keys of the link, or the factors of all peers.

@@ -32,8 +32,9 @@ class Mode(IntEnum):
     DIVERGED: a joint was too fast, or a value was not finite. This mode is final.
 
     The rule `glide` (see `core.life.session_life`) has additional modes, in all of which the
-    arm is at rest. WAITING: samples have not yet arrived from all other arms. FAULT: a limit
-    was exceeded; this mode replaces DIVERGED. STOPPED: the arm was stopped by a command.
+    arm comes to rest. WAITING: samples have not yet arrived from all other arms. FAULT: for
+    example, a limit was exceeded; this mode replaces DIVERGED. STOPPED: the arm was stopped,
+    for example by a command.
     """
 
     RUN = 1
@@ -58,7 +59,7 @@ class Arrival(NamedTuple):
         qd: Joint velocities of the peer, rad/s.
         latency_us: Measured network latency, us. Recorded for information only.
         tau_x: External torque of the peer, N m, for control laws that reflect force. The torque
-            ON its arm is the negative.
+            ON the peer's arm is minus this value.
         ch: Additional values sent by the control law of the peer. See `core.plug.law_channel`.
     """
 
@@ -161,8 +162,8 @@ class Layout(NamedTuple):
         task: True if the coordinates are the pose of the end effector. False if they are joint
             angles.
         sent: Number of values that the control law sends to other arms in each tick.
-        hand: Number of values that describe a live hand, see `core.life.live_hand`. 0 if there
-            is no live hand.
+        hand: Number of values that describe a live hand (a person or program that moves the arm
+            during the run), see `core.life.live_hand`. 0 if there is no live hand.
         bodies: Number of values in the poses of other bodies in the scene, see
             `TickRecord.bodies`.
     """
@@ -221,7 +222,7 @@ class Layout(NamedTuple):
         return columns
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the recorded values that contain the state of the rule `glide`.
+        """Returns the number of recorded values that contain the state of the rule `glide`.
 
         Under this rule, an arm comes to rest while another arm is silent (see
         `core.life.session_life`). The values are needed to resume a run while the arm is at
@@ -267,7 +268,7 @@ class Layout(NamedTuple):
         return slice(first, first + length)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the lost arms without which this arm continues.
+        """Returns the names of the arms that were lost while this arm continued without them.
 
         The names are decoded from a record in this arm's log.
 

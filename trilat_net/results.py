@@ -50,7 +50,7 @@ class Result:
     def summary(self) -> str:
         """Returns the text that the command prints in the terminal.
 
-        For a command with the option --all, this is the text that it prints with the option.
+        If the command has the option --all, this is the text that it prints with that option.
         """
         return str(find_hook("summarize a result")(self))
 

@@ -37,8 +37,8 @@ class Interrupt:
     example one started by `nohup`, continues to ignore it.
 
     Args:
-        compiles: True if a signal may end the process immediately during a compilation, which
-            is allowed if the process has nothing to finish at that time.
+        compiles: True if a signal may end the process immediately during a compilation. The
+            caller must then have nothing to finish at that time.
 
     Attributes:
         number: Number of the first signal. 0 if no signal has arrived.

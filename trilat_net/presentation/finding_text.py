@@ -40,8 +40,8 @@ def describe_finding(finding: Any) -> str:
 def list_finding_sentences(finding: Any) -> list[str]:
     """Returns one sentence for each part of a finding that has several parts.
 
-    For example, the sentences explain why the stability of a run cannot be determined from the
-    end of its motion.
+    For example, the sentences may explain why the stability of a run cannot be determined from
+    the end of its motion.
 
     Args:
         finding: The finding, with its numerical evidence.

@@ -61,16 +61,16 @@ Tree = str | JsonObject
 
 
 def write_foxglove_layout(log: Path, *, force: bool = False) -> Path:
-    """Writes the layout of a log or a bag for the viewers Foxglove and Lichtblick.
+    """Writes a layout with which the viewers Foxglove and Lichtblick show a log or a ROS bag.
 
     With this layout, the viewer shows plots of all sites without any manual arrangement.
 
     Args:
-        log: File of the log or bag.
+        log: File of the log or ROS bag.
         force: True to replace an existing file.
 
     Returns:
-        The path of the layout, which is next to the log.
+        The path of the layout file, which is in the same folder as the log.
 
     Raises:
         UsageError: The file contains no channels for viewers, or the layout already exists.

@@ -51,16 +51,16 @@ def _find_plugin_hand(log: Log, site: str) -> tuple[str, TorqueSource]:
 def find_plugin_actions(log: Log, site: str) -> str:
     """Returns the kind of actions to use when exporting a log for the LeRobot plugin.
 
-    The plugin commands the operator model of an arm through positions of its end effector
-    ("tip") or through joint angles. A dataset for training must contain the same kind of
-    action.
+    Depending on the operator, the actions are positions of the end effector ("tip") or joint
+    angles ("joints"). A dataset for training must contain the actions that the operator
+    accepts.
 
     Args:
         log: Log of the run.
-        site: Name of the site whose arm the plugin holds.
+        site: Name of the site whose arm the plugin moves.
 
     Raises:
-        UsageError: The operator of the site is commanded by forces, which are not exported.
+        UsageError: The operator moves the arm by commanding forces, which are not exported.
     """
     mode, _ = _find_plugin_hand(log, site)
     if mode not in _HAND_ACTIONS:
@@ -76,19 +76,19 @@ def observe_as_plugin(
 ) -> tuple[Array, list[str]]:
     """Returns the observations that the LeRobot plugin would make in every frame of a log.
 
-    This allows training a policy from logs and later running it through the plugin.
+    A policy can therefore be trained on logs and later run through the plugin.
 
     Args:
         log: Log of the run.
         slave: Name of the slave.
-        site: Name of the site whose arm the plugin holds.
+        site: Name of the site whose arm the plugin moves.
         rows: For each site, the record index of each frame, shape (F,).
 
     Returns:
         The observations, shape (F, n), and the names of the n components.
 
     Raises:
-        UsageError: The scenario has no operator for the plugin at this site.
+        UsageError: The scenario does not allow a program to move the arm of this site.
     """
     mode, source = _find_plugin_hand(log, site)
     columns: list[Array] = []

@@ -31,7 +31,7 @@ def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
     The arms, their controllers and the network delays form a loop, which the analysis has
     linearised at a rest pose (equilibrium). The text contains, in order, the equilibrium, the
     delays, the characteristic roots, the stability verdict, the delay margin, notes, what
-    operators feel at the arms, and scans of settings.
+    operators feel at the arms, and the values of settings at which the stability changes.
 
     Args:
         analysis: The linear analysis.
@@ -184,7 +184,7 @@ def _tabulate_roots(analysis: LinearAnalysis) -> TextTable:
 
 
 def describe_moving_states(states: Sequence[str]) -> str:
-    """Returns a phrase that lists the states of a loop that move together, and their sites.
+    """Returns a phrase that lists the states that take part in a motion, with their sites.
 
     Each state is listed once, with all of its sites: "q2 of m1, m2, s" stands for the second
     joint angle of three sites.
@@ -278,7 +278,7 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
 
     The lines cover three properties:
 
-    - passivity: the arms never supply energy to the operators,
+    - passivity: the arms never supply more energy to the operators than they have received,
     - absolute stability: the arms are stable with any passive operators,
     - transparency: the impedance that an operator feels while another arm is free or clamped.
 
@@ -334,9 +334,9 @@ def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
     """Returns lines about the passivity of all ports together, of each joint, and in the proof.
 
     A port is a joint or axis at which an operator holds an arm. The arms are passive if they
-    never supply energy to the operators. The stability proof requires operators that are
-    passive with respect to r, the velocity plus Lambda times the error e, instead of the
-    velocity.
+    never supply more energy to the operators than they have received. The stability proof
+    requires operators that are passive with respect to r, the velocity plus Lambda times the
+    error e, instead of the velocity.
 
     At zero frequency, the admittance Y (velocity per torque) may have a pole, because a
     constant torque makes a velocity grow. For free masses, this is compatible with passivity.

@@ -28,10 +28,10 @@ _MAX_LOSSES = 10
 
 
 def compose_log(log: Log) -> Iterator[Block]:
-    """Yields the text with which a command introduces a recorded run.
+    """Yields the text that summarises a recorded run.
 
-    The text consists of a line about the session, a table with one row per arm, and the notable
-    facts of the run, such as alarms and setting changes.
+    The text consists of a line about the session, a table with one row per arm, and notable
+    facts about the run, such as alarms and setting changes.
 
     Args:
         log: Log of the run.
@@ -48,7 +48,7 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns lines about the notable facts of a run, such as alarms and changed delays.
+    """Returns lines with notable facts about a run, such as alarms and changed delays.
 
     The lines cover alarms, user code, links, changes, modes and clocks. Long lists are
     truncated, see `_limit_lines`.
@@ -288,7 +288,7 @@ def compose_checks(report: CheckReport) -> Iterator[Block]:
 
 
 def compose_verification(report: LogCheckReport) -> Iterator[Block]:
-    """Yields the results of the log checks, and the notable facts of a run that passed them.
+    """Yields the results of the log checks and, if the log passed, notable facts about the run.
 
     Args:
         report: Results of the checks.
@@ -325,8 +325,8 @@ def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
 def compose_recovery(recovery: Recovery) -> Iterator[Block]:
     """Yields the outcome of recovering a truncated log.
 
-    The first line names the new file. A table lists which records were recovered, and which
-    were lost or are missing.
+    The first line names the new file. A table states how many records were recovered, and lists
+    what was lost and what is missing.
 
     Args:
         recovery: Result of the recovery.

@@ -46,7 +46,7 @@ _ARM_NOTE = (
 
 
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
-    """Renders the top of a report: the moving arms, the leading users, errors and delays.
+    """Renders the top of a report: the moving arms, who leads the slave, errors and delays.
 
     This part lets a reader understand the run without reading further.
 

@@ -179,7 +179,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         end_s: End of the time axis, in s.
         colours: Colours of the sites.
-        tables: Numerical tables, referred to by index from charts and arms.
+        tables: Numerical tables, to which the charts and arms refer by index.
         charts: Charts in page order.
         changes: Changes during the run.
         spans: For each site, the intervals in which it does not follow its peers.
@@ -281,13 +281,13 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
         to_s: float
 
     class Palettes(msgspec.Struct, frozen=True):
-        """Colours of the arms for light and for dark screens.
+        """Colours of the arms for the light and the dark theme of the page.
 
         The colours are in scenario order, in CSS notation such as "#004488".
 
         Attributes:
-            light: Colours for light screens.
-            dark: Colours for dark screens.
+            light: Colours for the light theme.
+            dark: Colours for the dark theme.
         """
 
         light: list[str]

@@ -90,7 +90,7 @@ def render_table(
 
 
 def render_scrolling(content: Markup, label: str) -> Markup:
-    """Renders wide content in a region that scrolls sideways, also with the keyboard.
+    """Renders wide content in a region that can be scrolled sideways by mouse or keyboard.
 
     This keeps the page itself from becoming wider than the screen.
 

@@ -40,7 +40,7 @@ class SlaveLead(NamedTuple):
 
     Attributes:
         slave: Name of the slave.
-        peers: Names of the P peers that the slave follows at any time in the run.
+        peers: Names of the P peers that the slave follows at some time during the run.
         t_s: Times of the K points between which the factors change linearly, in s.
         shares: Dominance factor of each peer at these times, from 0 to 1, shape (K, P).
     """
@@ -61,7 +61,7 @@ class SlaveLead(NamedTuple):
 
     @classmethod
     def list_of_log(cls, log: Log) -> list["SlaveLead"]:
-        """Returns the dominance factors of each slave in a log over the run.
+        """Returns the dominance factors over time of each slave in a log.
 
         The bars, the sentences and the slider of the page use these data.
 
@@ -114,7 +114,7 @@ class SlaveLead(NamedTuple):
         )
 
     def describe_constant(self, scenario: Scenario) -> str:
-        """Returns a sentence that says who leads the slave, for factors that never change.
+        """Returns a sentence on who leads the slave if its dominance factors are constant.
 
         For example: "m1 leads the slave with 80 % and m2 with 20 %, during the whole run."
 
@@ -131,7 +131,7 @@ class SlaveLead(NamedTuple):
         return f"{join_words(phrases)}, during the whole run."
 
     def describe_phases(self) -> str:
-        """Returns a text that says who leads at which times.
+        """Returns a text that says who leads the slave, and when.
 
         An example is "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %". Ramps are
         omitted, because the time spans on either side show the factors before and after the

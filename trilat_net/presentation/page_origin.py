@@ -65,7 +65,7 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
 def summarise_origin(log: Log) -> str:
     """Returns the name, length and origin of a run on one line, for the top of the page.
 
-    The origin is, for example, a live session or virtual time.
+    The origin is, for example, a live session or a simulation in virtual time.
 
     Args:
         log: Log of the run.
@@ -77,7 +77,7 @@ def summarise_origin(log: Log) -> str:
 
 
 def describe_changes(scenario: Scenario) -> str:
-    """Returns how a scenario differs from the shipped scenario with the same name and title.
+    """Returns how a scenario differs from the example scenario with the same name and title.
 
     The title and description of a scenario refer to its original settings, but a run with other
     settings, for example from `trilat rerun`, has the same title and description. The reader
@@ -88,7 +88,8 @@ def describe_changes(scenario: Scenario) -> str:
 
     Returns:
         A phrase such as "every link: constant 800 ms instead of constant 400 ms". Empty if
-        there are no such differences, or if no shipped scenario has this name.
+        there are no such differences, or if no example scenario in the package has this name
+        and title.
     """
     if scenario.name not in list_shipped():
         return ""

@@ -11,8 +11,8 @@ from .result_text import Block, TextTable
 def compose_rerun(rerun: Rerun) -> Iterator[Block]:
     """Yields the text that compares a rerun with the log of the original run.
 
-    The text names the sites that were computed again and the changed settings. It compares the
-    motion of their arms, and the ages of the samples that they used, with the log.
+    The text names the sites that were run again and the settings that were changed. It compares
+    the motion of their arms, and the ages of the samples that they used, with the log.
 
     Args:
         rerun: Result of the rerun.

@@ -237,12 +237,12 @@ PlotPage = list[list[CurvePlot]]
 
 
 class PlotLayout(NamedTuple):
-    """Layout in which Rerun shows a log: pages, plots, and arms in space.
+    """Layout in which a viewer shows a log: pages with plots, and a 3D view of the arms.
 
     Attributes:
         pages: Mapping from the name of each page to its rows of plots.
         lines: Topic of the event messages. Empty if the log has no such topic.
-        arms: True to show the arms in space.
+        arms: True to include the 3D view of the arms.
     """
 
     pages: dict[str, PlotPage]

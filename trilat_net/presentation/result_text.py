@@ -207,7 +207,8 @@ class MarkedText(NamedTuple):
         """Returns the text as one line without colours, such as "ok all records".
 
         Returns:
-            A list with a single line, since other kinds of block have several lines.
+            A list that contains this line only. The result is a list because other kinds of
+            block have several lines.
         """
         if not self.mark:
             return [self.text]
@@ -303,7 +304,7 @@ def summarize(result: Result) -> str:
     """Renders the result of a command as plain text, for printing it in a Python session.
 
     Args:
-        result: Result of a command or function, which yields its text through `blocks`.
+        result: Result of a command or function.
     """
     lines = []
     for block in compose(result):
@@ -315,6 +316,6 @@ def render_html(result: Result) -> str:
     """Renders the result of a command as HTML with tables, for example for a notebook.
 
     Args:
-        result: Result of a command or function, which yields its text through `blocks`.
+        result: Result of a command or function.
     """
     return "\n".join(block.html() for block in compose(result))

@@ -576,7 +576,7 @@ def time_figure(
     height_in: float,
     interval_s: tuple[float, float] | None = None,
 ) -> Iterator["TimeFigure"]:
-    """Context manager that provides an empty figure whose panels show a run over time.
+    """Context manager that provides an empty figure for panels that show a run over time.
 
     Args:
         log: Log of the run.
@@ -772,7 +772,7 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Completes a figure with time axes, a legend, and a text about the marked changes.
+        """Completes a figure with time axes, a legend, and a note that explains marked changes.
 
         Functions that draw a figure call this last.
 

@@ -80,7 +80,7 @@ def print_text(text: object, console: Console = out, head: str = "") -> None:
     Args:
         text: The line.
         console: The console, for standard output or standard error.
-        head: Text printed before the line, which is not sanitized.
+        head: Text to print before the line. This text is not passed to `sanitize`.
     """
     console.print(head + sanitize(text, MAX_LETTERS), markup=False, soft_wrap=True)
 
@@ -175,7 +175,8 @@ def print_table(table: "TextTable") -> None:
 def print_result(result: "Result", *, as_json: bool = False, brief: bool = False) -> None:
     """Prints the result of a command, as text for people or as JSON for programs.
 
-    All commands with results end with this call, which keeps their output uniform.
+    Every command that has a result ends by calling this function, so that all output is
+    uniform.
 
     Args:
         result: The result of a command.

@@ -248,16 +248,16 @@ def describe_quantities(quantities: premise_quantities.PremiseQuantities) -> str
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms, and why, the stability proof has no energy function V.
+    """Names the arms for which the stability proof has no energy function V, and says why.
 
-    If there is such an arm, a certificate judges the run without V.
+    If there is such an arm, the stability of a run is judged without V.
 
     Args:
         scenario: Scenario of the run.
 
     Returns:
-        The names of these sites with the reasons, separated by semicolons. Empty if V exists
-        for every arm.
+        The names of the sites of these arms with the reasons, separated by semicolons. Empty if
+        V exists for every arm.
     """
     return _describe_missing_functionals(
         premise_quantities.MissingFunctional.list_of_scenario(scenario)

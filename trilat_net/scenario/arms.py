@@ -438,7 +438,7 @@ class ArmModel(NamedTuple):
         of the site.
 
         Args:
-            limits: Motion limits of the site that runs the arm.
+            limits: Motion limits of the site to which the arm belongs.
         """
         joints = self.counts.joints
         low = np.broadcast_to(np.array(limits.q_min, dtype=np.float64), joints)
@@ -482,7 +482,7 @@ class ArmModel(NamedTuple):
     def task_jacobian(self, q: Vector) -> Array:
         """Returns the Jacobian J that maps joint velocities to task velocities: xd = J qd.
 
-        Task coordinates apply only if the arms follow each other's end effectors.
+        Call this method only if the arms follow each other's end effectors.
 
         Args:
             q: Joint positions in rad, or in m for a prismatic joint, shape (n,).
@@ -538,7 +538,7 @@ class ArmModel(NamedTuple):
         time constant. Since the joints are coupled, the fastest motion decays at the rate
         lambda / T, where lambda is the largest eigenvalue of diag(M) M^-1. T is chosen so that
         the time constant T / lambda of this motion is at least `BRAKE_TICKS` ticks. If the
-        inertia is unknown, B is the damping of the control law, for the joints where that
+        inertia is unknown, B is instead the damping of the control law at each joint where that
         damping is positive.
 
         Args:

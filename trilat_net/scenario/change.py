@@ -44,7 +44,8 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
     def start_ns(self) -> int:
         """Time at which the change takes effect, in ns after the common start of the session.
 
-        An integer, as are all simulation times, to give identical results on every machine.
+        Like all simulation times, this is an integer, so that results are identical on every
+        machine.
         """
         return round(self.at_s * 1e9)
 
@@ -121,7 +122,7 @@ class Change(RecordedChange, frozen=True, omit_defaults=True):
 
     @staticmethod
     def find_requester(sentence: str) -> str:
-        """Extracts from a logged sentence who requested a stop.
+        """Finds out from a logged sentence who requested a stop.
 
         Args:
             sentence: A sentence that `describe` returned.

@@ -379,7 +379,10 @@ class ScenarioDifference(NamedTuple):
 
     @property
     def concerns_link(self) -> bool:
-        """True if the key belongs to a network link, such as "link m1->s"."""
+        """True if the difference concerns the settings of network links.
+
+        The key is then "every link" or, for example, "link m1->s".
+        """
         return self.key == _EVERY_LINK or self.key.startswith(_SOME_LINKS)
 
     def __str__(self) -> str:

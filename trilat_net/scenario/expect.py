@@ -96,7 +96,7 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @property
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """Yields the name and limits of each quantity that is checked in this window.
+        """Yields the name and limits of each quantity that is checked in this part of the run.
 
         The name ends in the unit. The limits are the smallest and the largest permitted value,
         for example (0.0, 0.01). Yields nothing if no quantity is checked.
@@ -108,7 +108,7 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @staticmethod
     def list_quantities(joints: int) -> tuple[str, ...]:
-        """Returns the names of the quantities that can be limited in a window.
+        """Returns the names of the quantities for which a scenario can specify limits.
 
         The list includes quantities of individual joints such as q1_rad, so its length depends
         on the arm.
@@ -325,7 +325,7 @@ class Expect(
 
     @property
     def has_expectations(self) -> bool:
-        """True if there is at least one condition for runs to satisfy.
+        """True if there is at least one condition that a run must satisfy.
 
         A tolerance alone does not count, since it only qualifies other conditions.
         """

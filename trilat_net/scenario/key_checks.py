@@ -57,7 +57,8 @@ class VectorCounts(NamedTuple):
 
         Args:
             joints: Number of joints of the arm.
-            shared: Number of coordinates that the sites exchange. If 0, the number of joints.
+            shared: Number of coordinates that the sites exchange. If 0, this is the number of
+                joints.
         """
         return cls(
             joints=joints,

@@ -136,8 +136,8 @@ def _join_link(written: TomlTable, common: TomlTable, path: str) -> TomlTable:
 def change_link(written: TomlTable, name: str, current: TomlTable, path: str) -> TomlTable:
     """Returns the complete table of a link after a change during a run.
 
-    A change must not read a file, move the outages of the link, or replace one delay trace with
-    another.
+    A change must not name a file, alter the outages of the link, or replace one delay trace
+    with another.
 
     Args:
         written: Table `to` of the change, which contains the keys to change.

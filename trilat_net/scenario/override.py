@@ -135,7 +135,7 @@ class ScenarioOverrides(NamedTuple):
     def apply_to(self, tables: TomlTable) -> None:
         """Applies the overrides to the tables of a scenario file.
 
-        A number in a key is a list index that starts at 0, as in
+        A number in a key is a list index, counted from 0, as in
         sites.s.environment.0.stiffness_n_m. Setting a key that selects a kind (the model or
         preset of a link, a law, the URDF file of an arm) removes the other keys of its table,
         which belong to the previous kind.

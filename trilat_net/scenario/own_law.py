@@ -26,7 +26,8 @@ def complete_own_law(code: str, written: TomlTable, common: TomlTable, path: str
     Args:
         code: Module and class, for example "package.module:Law".
         written: Table `control` of the site: the key `law` and the arguments of the class.
-        common: Table `control` for all sites. Its arguments apply if it names the same class.
+        common: Table `control` for all sites. The arguments in this table apply if the table
+            names the same class.
         path: Path of the table, for error messages.
 
     Raises:

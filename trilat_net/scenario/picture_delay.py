@@ -58,7 +58,7 @@ class PictureDelay:
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the index of the sample that the user sees of each peer in one tick.
+        """Returns, for each peer, the index of the sample that the user sees in one tick.
 
         Args:
             tick: The tick, no earlier than that of the previous call.

@@ -89,7 +89,7 @@ class _PlantProgram(Protocol):
 
 
 class PlantPlayer:
-    """Runs the plant of one site, one control period at a time.
+    """Runs a user's plant, which computes the motion of one arm, one period at a time.
 
     Args:
         scenario: The scenario.

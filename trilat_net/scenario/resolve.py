@@ -128,7 +128,7 @@ def _complete_timeline(
 def complete_target(
     change: WrittenChange, current_links: TomlTable, site_names: list[str], path: str
 ) -> TomlTable:
-    """Completes the new settings in a planned or requested change.
+    """Completes the new settings of a planned or requested change.
 
     Args:
         change: Change of a link, or of the dominance factors of a site.

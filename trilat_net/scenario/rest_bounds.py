@@ -81,10 +81,10 @@ def find_rest_bounds(scenario: Scenario, site: str) -> _RestBounds:
     The user of a real arm needs to know how long and how fast the arm can move after a stop.
 
     Args:
-        scenario: The scenario. The stale rule of the site must be "glide", under which an arm
-            is brought to rest by damping when its site stops.
-        site: Name of the site whose arm stops. Initially, its joints move as fast as its limits
-            allow.
+        scenario: The scenario. The reaction of the site to missing samples (`on_stale.action`)
+            must be "glide". The arm is then brought to rest by damping when its site stops.
+        site: Name of the site whose arm stops. The joints are assumed to move initially as fast
+            as the limits of the site allow.
     """
     spec = scenario.sites[site]
     setup = scenario.setup(site)

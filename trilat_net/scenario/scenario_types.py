@@ -262,8 +262,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         Every control law has its own conditions, for example on its gains and on the delays.
         Sites with the same law and the same condition share one line.
 
-        Most conditions are proved for continuous-time controllers. A controller that acts once
-        per tick may be unstable even if its condition holds.
+        Most conditions are proved for continuous-time controllers. With a controller that acts
+        once per tick, the loop may be unstable even if the condition holds.
 
         Args:
             ticks_grow: True if the discrete-time loop is known to be unstable. The lines about
@@ -542,7 +542,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
         Raises:
             ScenarioError: An arm is external, or a link has the model "measured", whose delay
-                is that of the real network. In virtual time, there is no real network.
+                is that of the real network. A simulation has no real network.
         """
         self.refuse_external_arms()
         if not self.measured:
@@ -594,8 +594,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def open_hands(self) -> tuple[str, ...]:
         """Names of the sites whose arms any member of the session may move.
 
-        A member is a process that takes part in the session, such as a page or a bridge. Arms
-        operated by a user's program are excluded, since only that program moves them.
+        A member is a process that takes part in the session, such as the live web page or the
+        ROS 2 bridge. Arms operated by a user's program are excluded, since only that program
+        moves them.
         """
         return tuple(
             name
@@ -607,8 +608,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def sites_may_return(self) -> bool:
         """True if a site may leave a live session and return to it.
 
-        Requires the stale rule "glide" at every arm (see `OnStale`): the other arms come to
-        rest and then follow the returning arm smoothly.
+        Every site must have the reaction "glide" to missing samples (see `OnStale`). The other
+        arms then come to rest, and later follow the returning arm smoothly.
         """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
@@ -626,8 +627,8 @@ class Scenario(Frozen, frozen=True, dict=True):
     def channel(self, site: str) -> LawChannel:
         """Returns the additional vectors that the control law of a site sends to its peers.
 
-        Most laws send nothing but the state of the arm. A law that sends waves, for example,
-        has a vector for them.
+        Most laws send nothing but the state of the arm. A law that also sends wave variables,
+        for example, has a vector for them.
 
         Args:
             site: Name of the site.
@@ -748,7 +749,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             site: Name of the site.
 
         Returns:
-            The changes in the form read by the kernel. Empty if none are planned.
+            The changes in the form read by the control loop. Empty if none are planned.
         """
         return [
             self.ramp(site, change.to, change.start_ns, change.ramp_s)
@@ -759,9 +760,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     def make_site_order(
         self, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
     ) -> Change:
-        """Converts a command to a site, such as stop, to a `Change`.
+        """Returns a command for a site, such as "stop", in the form of a `Change`.
 
-        In this form, the command can be sent and logged like a change of the network.
+        The command can then be sent and logged like a change of a link.
 
         Args:
             site: Name of the site that must carry out the command.

@@ -74,7 +74,7 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> StaleRule:
-        """The stale rule in the form read by the control loop.
+        """The reaction to old or missing samples, in the form read by the control loop.
 
         Times are converted from ms to integers in ns, since the compiled code computes with
         integers.
@@ -178,8 +178,8 @@ class SiteSpec(Frozen, frozen=True):
     """Description of a site in a scenario: an arm and its control loop.
 
     Attributes:
-        role: Role of the site, shown in figures and used by the stale rule "degrade". Does not
-            enter any formula.
+        role: Role of the site, shown in figures and used if `on_lost` is "degrade" (see
+            `OnStale`). Does not enter any formula.
         rate_hz: Tick rate of the control loop, in Hz.
         q0_rad: Start pose, in rad.
         qd0_rad_s: Start velocity, in rad/s.
@@ -231,8 +231,8 @@ class SiteSpec(Frozen, frozen=True):
         The gains of a user's law are the arguments of its class.
 
         Args:
-            with_defaults: If True, arguments that the scenario leaves to the class of a user's
-                law are included.
+            with_defaults: If True, arguments of a user's law that the scenario omits are
+                included, with their default values.
         """
         gains = msgspec.structs.asdict(self.control)
         if self.user_law is not None:
@@ -264,7 +264,7 @@ class SiteSpec(Frozen, frozen=True):
         return any(isinstance(hand, ProgramHand) and hand.process for hand in self.hands)
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
-        """Returns the operator who may move the arm while the session runs.
+        """Returns the live operator: the person or program that may move the arm in a session.
 
         Args:
             is_open: If True, only consider an operator whose role any member of the session may
@@ -401,11 +401,11 @@ class SiteSpec(Frozen, frozen=True):
     def describe_jump(self) -> KeyProblem:
         """Returns why the reference of a real robot may jump when a peer falls silent.
 
-        A jump would move the robot suddenly, so the stale rule must be "glide". Call this
-        method only if the site has another rule.
+        A jump would move the robot suddenly, so `on_stale.action` must be "glide". Call this
+        method only if it is not.
 
         Returns:
-            The key of the stale rule, and the problem.
+            The key `on_stale.action`, and the problem.
         """
         return KeyProblem(
             "on_stale.action",

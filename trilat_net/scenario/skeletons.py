@@ -112,7 +112,8 @@ def _is_other_module(module: str, file: Path) -> bool:
 def name_skeleton_class(module: str, kind: str) -> str:
     """Derives the name of the class in a skeleton file from the module name.
 
-    For example, mylaw and my_law contain the class MyLaw, and spring contains Spring.
+    For example, the modules mylaw and my_law contain the class MyLaw, and the module spring
+    contains Spring.
 
     Args:
         module: Name of the Python module that contains the skeleton.

@@ -98,7 +98,8 @@ class UrdfJoint(NamedTuple):
         axis: Unit vector of the joint axis in the joint frame.
         rotation: Orientation of the joint frame at q = 0, as three rows, relative to the frame
             of the previous moving link (the base frame for the first joint).
-        origin_m: Origin of the joint frame in that same frame, in m.
+        origin_m: Origin of the joint frame, in m, in the frame of the previous moving link (the
+            base frame for the first joint).
         inertia: Inertial parameters of the body in the joint frame, including everything fixed
             to the link.
         lower: Smallest position, in rad or m; -inf if the file has no limit.
@@ -133,7 +134,7 @@ class UrdfChain(NamedTuple):
         joints: 1 to `MAX_JOINTS` joints, from the base to the tip.
         tip_rotation: Orientation of the tip in the frame of the last moving link, as three
             rows.
-        tip_origin_m: Origin of the tip in that same frame, in m.
+        tip_origin_m: Origin of the tip in the frame of the last moving link, in m.
         notes: Notes on details that the author of the file may not have intended, as sentences.
     """
 

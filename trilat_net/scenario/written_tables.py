@@ -129,7 +129,7 @@ class WrittenScenario(Frozen, frozen=True, kw_only=True):
         rate_hz: Default tick rate, in Hz.
         arm: Default arm of all sites.
         limits: Default limits of all sites.
-        on_stale: Default stale rule of all sites.
+        on_stale: Default reaction of all sites to old or missing samples.
         task: Default shared coordinates of all sites.
         control: Default control law of all sites, with its gains.
         link: Default settings of all links.

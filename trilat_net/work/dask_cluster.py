@@ -59,7 +59,7 @@ def describe_worker() -> WorkerIdentity:
     """Returns everything about this process that its numerical results depend on.
 
     A worker of a cluster may run items of a study only if its description equals that of the
-    process that started the study, as otherwise the results could differ.
+    process that started the study, apart from the commit. Otherwise, the results could differ.
     """
     digest = hashlib.sha256()
     for root in _find_sources():
@@ -95,7 +95,7 @@ class WorkerRequirements(NamedTuple):
     Attributes:
         identity: Properties that the worker must have.
         laws: Pairs of the name of an imported control law, such as "mylaws:Spring", and the
-            SHA-256 of its file. The worker must have this file.
+            SHA-256 of its file. The worker must have these files.
     """
 
     identity: WorkerIdentity
@@ -155,7 +155,7 @@ class WorkerRequirements(NamedTuple):
 
     @staticmethod
     def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-        """Returns the user-written control laws whose file is missing or different here.
+        """Returns the user's control laws whose file is missing or different on this worker.
 
         A worker without the right file could not run the study, or would compute different
         results.
@@ -190,14 +190,14 @@ def _make_probe() -> Callable[
     """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
-        """Describes the worker process that runs it, and checks its control-law files.
+        """Describes the current worker process, and checks its files of control laws.
 
         Args:
             laws: Pairs of the name of an imported control law and the SHA-256 of its file.
 
         Returns:
             The versions on which this process's results depend, and the names of the laws whose
-            file is missing here or has different contents.
+            file is missing on this worker or has different contents.
         """
         try:
             from trilat_net.work import dask_cluster
@@ -276,7 +276,7 @@ class DaskCluster:
                 the SHA-256 of its file.
 
         Returns:
-            The requirements, which workers that join later check themselves against.
+            The requirements, against which workers that join later check themselves.
 
         Raises:
             UsageError: No worker appeared within `CONNECT_S`, or a worker does not meet the

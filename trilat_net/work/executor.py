@@ -407,8 +407,8 @@ class WorkerPool:
         Args:
             function: Module-level function, so that other processes can import it.
             items: The items. Error messages identify an item by its `str`.
-            lost: Function that returns the result of an item that killed its workers. `None` if
-                such an item is an error.
+            lost: Function that returns the result of an item that killed its workers. `None` to
+                raise an error for such an item.
             count: Number of items, if it is known.
             together: Function that replaces `function` for several items at once.
             together_count: Number of items to pass to `together`.

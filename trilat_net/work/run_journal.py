@@ -152,7 +152,7 @@ class _StoredRuns(Mapping[tuple[Any, int], E]):
         self._file: BinaryIO | None = None
 
     def add_offset(self, key: _RunKey, offset: int) -> None:
-        """Records where in the file a finished run is stored, in bytes.
+        """Stores the position in the file at which a finished run is recorded.
 
         If a run occurs twice, the first occurrence counts.
 

@@ -42,7 +42,7 @@ FIGURES = FigureEntry.list_all()
 def figure(
     log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN
 ) -> Figure:
-    """Returns a figure of a log for a paper, with 8 pt text.
+    """Returns a figure drawn from a log, formatted for a paper with 8 pt text.
 
     Notebooks display the figure inline. The corresponding command is `trilat figure`.
 
@@ -55,8 +55,8 @@ def figure(
         width_in: Width of the figure: 3.5 in for one column of a paper, or 7 in for two.
 
     Raises:
-        UsageError: There is no such figure, the width is neither 3.5 nor 7 in, or the log has
-            nothing to show in the figure.
+        UsageError: There is no such figure, the width is neither 3.5 nor 7 in, or the figure
+            cannot be drawn from the log.
     """
     form = FigureSize.for_print(width_in)
     opened = log if isinstance(log, Log) else open_log(log)
@@ -64,7 +64,7 @@ def figure(
 
 
 def list_drawable_figures(log: Log) -> list[str]:
-    """Lists the names of the figures for which a log has something to show.
+    """Lists the names of the figures that can be drawn from a log.
 
     For example, a run without walls has no contact figure.
 
@@ -84,12 +84,12 @@ def write_figures(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Draws figures of a log and writes them to files, with the sizes and fonts of a paper.
+    """Draws figures from a log, formatted for a paper, and writes them to files.
 
     Args:
         log: Log of the run.
         folder: Folder for the files. Created if it does not exist.
-        names: Names of figures. Empty for all figures for which the log has something to show.
+        names: Names of figures. Empty for all figures that can be drawn from the log.
         width_in: Width of the figures, 3.5 or 7 in.
         formats: File formats, from `FIGURE_FORMATS`.
         force: True to overwrite existing files.
@@ -99,8 +99,8 @@ def write_figures(
         The paths of the files.
 
     Raises:
-        UsageError: A figure or a format is unknown, the width is neither 3.5 nor 7 in, the log
-            has nothing to show in a figure, or a file exists.
+        UsageError: A figure or a format is unknown, the width is neither 3.5 nor 7 in, a figure
+            cannot be drawn from the log, or a file exists.
     """
     form = FigureSize.for_print(width_in)
     unique_names = list(dict.fromkeys(names))
@@ -140,8 +140,8 @@ def write_overlay(
         logs: Mapping from the legend name of each run to its log.
         folder: Folder for the files. Created if it does not exist.
         names: Names of the figures: overlay, positions, tracking_errors or control_torques. If
-            empty, all of them are written, or only overlay if there are too many runs for the
-            others or the runs have no site in common.
+            empty, all of these figures are written, or only overlay if there are more runs than
+            dash patterns or the runs have no site in common.
         width_in: Width of the figures, 3.5 or 7 in.
         formats: File formats, from `FIGURE_FORMATS`.
         force: True to overwrite existing files.
@@ -151,8 +151,8 @@ def write_overlay(
 
     Raises:
         UsageError: A figure or a format is unknown, the width is neither 3.5 nor 7 in, the
-            errors of the logs have different units, the logs cannot be drawn in a figure, or a
-            file exists.
+            errors of the runs have different units, there are more runs than dash patterns, the
+            runs have no site in common, or a file exists.
     """
     form = FigureSize.for_print(width_in)
     known_names = (OVERLAY, *COMPARED_SIGNALS)
@@ -185,7 +185,7 @@ def write_report_figures(
 ) -> list[Path]:
     """Writes the figures of a run's report as PNG files.
 
-    Figures for which the log has nothing to show are omitted. Existing files in the folder are
+    Figures that cannot be drawn from the log are omitted. Existing files in the folder are
     replaced.
 
     Args:
@@ -194,7 +194,8 @@ def write_report_figures(
         twin: Log of the same run without operators. `None` to omit the figure that shows how
             far operators moved the arms.
         progress: Function that is called with the number of drawn figures and the total number.
-        pushed: Effects of small pushes in repetitions of the run. `None` to compute them here.
+        pushed: Effects of small pushes in repetitions of the run. `None` if they have not been
+            computed yet.
 
     Returns:
         The paths of the files.
@@ -277,7 +278,7 @@ def _find_figure(log: Log, name: str) -> FigureEntry:
         name: Name of the figure.
 
     Raises:
-        UsageError: No figure has this name, or the log has nothing to show in it.
+        UsageError: No figure has this name, or the figure cannot be drawn from the log.
     """
     if name == OVERLAY:
         raise UsageError("overlay shows several runs in one figure: add --with FILE")

@@ -141,7 +141,7 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
         form: Width, font sizes and resolution of the figure.
 
     Raises:
-        UsageError: There is no log, or the errors of the runs have different units.
+        UsageError: No log is given, or the errors of the runs have different units.
     """
     units = {plot_signals.shared_unit(log) for log in logs.values()}
     if not units:

@@ -92,8 +92,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         outages_s: Intervals of send time, in s, in which every sample is lost.
         order: "newest" to discard a sample that arrives after a newer one, or "in_order" to
             prevent a sample from overtaking an earlier one.
-        playout_ms: Play-out delay, in ms. Every sample is held until at least this long after
-            it was sent, which removes the jitter of all shorter delays.
+        playout_ms: Play-out delay, in ms. Every sample is held until this time has passed since
+            it was sent. All shorter delays therefore become equal to the play-out delay.
     """
 
     loss: Probability = 0.0
@@ -168,7 +168,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
     def moments(self) -> _DelayMoments:
-        """Mean and standard deviation of the delay distribution configured for the link.
+        """Returns the mean and standard deviation of the delay distribution of the link.
 
         The delay in a run can differ, since three effects are not included: the play-out delay
         `playout_ms`, in-order delivery (`order`), and the upper limit on all delays,
@@ -256,8 +256,8 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
     def find_problem(self) -> KeyProblem | None:
         """Checks the keys of the link for contradictions between them.
 
-        For example, an outage must not end before it starts. Single keys have already been
-        checked by their types.
+        For example, an outage must not end before it starts. Each value has already been
+        checked against its type.
 
         Returns:
             The key and the reason, or None if the keys are consistent.

@@ -192,9 +192,9 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.
-        fast_ms: Mean of the frequent random part, in ms.
-        slow_ms: Mean of the rare random part, in ms.
-        slow_share: Probability of the rare part.
+        fast_ms: Mean of the random part of a fast message, in ms.
+        slow_ms: Mean of the random part of a slow message, in ms.
+        slow_share: Probability that a message is slow.
     """
 
     floor_ms: Milliseconds

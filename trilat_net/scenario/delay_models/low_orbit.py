@@ -18,11 +18,10 @@ from . import Milliseconds, OwnDelay
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
     """Delay of a low-orbit satellite network such as Starlink.
 
-    These networks reassign terminals to satellites every 15 s, all terminals at once, and delay
-    and jitter change abruptly each time: Mohan et al., "A Multifaceted Look at Starlink
-    Performance", WWW (2024). The model is the sum of a fixed delay, an exponentially
-    distributed part drawn once per interval, and an exponentially distributed part drawn for
-    every message.
+    These networks reassign all terminals to satellites every 15 s, at the same time. Delay and
+    jitter then change abruptly (Mohan et al., "A Multifaceted Look at Starlink Performance",
+    WWW 2024). The model is the sum of a fixed delay, an exponentially distributed part drawn
+    once per interval, and an exponentially distributed part drawn for every message.
 
     Attributes:
         floor_ms: Fixed part of the delay, in ms.

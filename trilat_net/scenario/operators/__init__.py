@@ -37,8 +37,8 @@ from ..refusals import MAX_QUOTED_LENGTH
 class HeldArm(NamedTuple):
     """Properties of an arm that determine defaults of its operators and environments.
 
-    For example, the target to which an operator pulls the arm is initially the position of the
-    arm.
+    For example, the target to which an operator pulls the arm is initially at the position of
+    the arm.
 
     Attributes:
         counts: Number of joints, task coordinates and parameters of the arm.
@@ -87,7 +87,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         """Adds defaults that depend on the arm to the settings of an operator or environment.
 
         For example, the default start position of an operator is the position of the arm.
-        Subclasses that have such settings override this method, which adds nothing by default.
+        Subclasses with such defaults override this method, which otherwise adds nothing.
 
         Args:
             table: Settings including all other defaults, modified in place.
@@ -159,11 +159,11 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
     def act(self, now: Any) -> None:
         """Computes the torque or force at one time and stores it in `now.effort`.
 
-        An implementation sets the entries with index i below `now.coordinates`. It is compiled,
-        and called in every stage of the integrator. It may use `now.t_s`, `now.at` (angles or
-        position) and `now.speed`. The result must depend only on the keys and on `now`, and
-        must have the same bits on every machine, so the only permitted functions are those of
-        `core.elementary` and `sqrt`.
+        An implementation sets all entries of `now.effort` with an index below
+        `now.coordinates`. It is compiled, and called in every stage of the integrator. It may
+        use `now.t_s`, `now.at` (angles or position) and `now.speed`. The result must depend
+        only on the keys and on `now`, and must have the same bits on every machine, so the only
+        permitted functions are those of `core.elementary` and `sqrt`.
 
         Args:
             now: Time and motion at which the torque is needed, and the field that receives the
@@ -174,9 +174,9 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:
         """Computes the same torques or forces as `act` for many times and motions at once.
 
-        This implementation is independent of `act`, and a test compares the two. The
-        linearisation of the control loop differentiates it by complex steps. Implementations
-        must therefore accept complex numbers and use real parts in conditions.
+        This implementation is independent of `act`, and a test compares the two. To linearise
+        the control loop, `effort` is differentiated by complex steps. Implementations must
+        therefore accept complex numbers and use real parts in conditions.
 
         Args:
             t_s: Times, in s.

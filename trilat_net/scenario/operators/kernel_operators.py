@@ -228,7 +228,7 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """Operator whose torque is a sine of varying frequency, used to measure responses.
+    """Operator whose torque is a sine of varying frequency, for measuring frequency responses.
 
     The frequency sweeps linearly from its first to its last value, for example from 0.1 to 10
     Hz, and the sweep is repeated.
@@ -311,7 +311,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
 
 
 class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
-    """Settings of a haptic device or controller used to move an arm.
+    """Settings of a haptic device or virtual-reality controller that is used to move an arm.
 
     The device moves a target, to which a spring pulls the end effector of the arm.
 
@@ -325,8 +325,8 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
         release: Button that lets go of the arm.
         force_scale: Ratio of the force on the device to the force of the arm on its operator.
         force_limit_n: Largest force on the device, in N.
-        jump_m_s: Speed of the device above which its motion is treated as a measurement error,
-            in m/s. Such a jump does not move the target.
+        jump_m_s: Speed of the device above which its motion is treated as a measurement error
+            and does not move the target, in m/s.
     """
 
     frame: Annotated[tuple[str, ...], Meta(max_length=3)] = ()

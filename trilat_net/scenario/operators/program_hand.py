@@ -62,9 +62,9 @@ class ProgramHand(
 ):
     """Operator that is a user's program (a Python class) instead of a person.
 
-    The program observes what its site knows, and moves, turns or pushes the arm. It takes hold
-    of the arm with its first action, and nobody else can hold that arm. Otherwise, the rules
-    are those of a live operator (see `LiveHand`).
+    The program observes the information available at its site, and moves, turns or pushes the
+    arm. It takes hold of the arm with its first action, and nobody else can hold that arm.
+    Otherwise, the rules are those of a live operator (see `LiveHand`).
 
     Attributes:
         code: Class of the program, for example "my_policy:Reach".
@@ -249,7 +249,7 @@ class HandSite(NamedTuple):
 class HandPlayer:
     """Calls a program that operates an arm, and passes its actions to the site.
 
-    A program that fails does not move the arm for the rest of the run.
+    A program that fails lets go of the arm for the rest of the run.
 
     Args:
         hand_site: The site, and the settings of the program.
@@ -257,7 +257,8 @@ class HandPlayer:
         watch: Function through which the program is called, for example with a time limit.
 
     Attributes:
-        hand: Schedule that decides when the program is called and when its actions take effect.
+        hand: Schedule that determines when the program is called and when its actions take
+            effect.
         failure: Reason why the program failed. Empty if the program has not failed.
         news: Events that have not been published yet, for example that the program took hold of
             the arm. Each event is a pair of tick number and sentence.
