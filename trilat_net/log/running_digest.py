@@ -68,7 +68,7 @@ class Integrity(NamedTuple):
         """False only if something in the file was modified or removed after it was recorded.
 
         A file without digests, or an unfinished file, cannot be compared. It passes, because
-        there is no evidence against it.
+        nothing shows that it was modified.
         """
         return self.state is not DigestState.CHANGED
 
@@ -100,7 +100,7 @@ class RunningDigest:
         self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
-        """Updates the hash of everything that describes the messages, such as schemas.
+        """Updates the hash of the records that describe the messages, such as schemas.
 
         The order of these records does not matter, and repeated records count once.
 

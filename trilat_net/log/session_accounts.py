@@ -131,13 +131,13 @@ class SessionAccounts:
             self._add_expected(site, topics.STATE, sequence + 1)
 
     def receive_event(self, topic: str, number: int, event: Event) -> bool:
-        """Counts an event, and evaluates what it states about the ticks of a site.
+        """Counts an event, and updates the ticks of the sites from the event (`apply_event`).
 
-        Each start of a site numbers its events from 0, and therefore has its own account. The
-        boot in the event, a random number, identifies the start. The first start uses the
-        account that `open_channel` created, and `_accounts` refers to the account of the newest
-        start. If there are more than `_MAX_STARTS` starts, which only a faulty sender causes,
-        the newest account also counts the events of all further starts.
+        A site numbers its events from 0 again whenever it is started, so each start has its own
+        account. The boot in the event, a random number, identifies the start. The first start
+        uses the account that `open_channel` created, and `_accounts` refers to the account of
+        the newest start. If there are more than `_MAX_STARTS` starts, which only a faulty
+        sender causes, the newest account also counts the events of all further starts.
 
         Args:
             topic: Topic of the event.
@@ -172,14 +172,13 @@ class SessionAccounts:
 
         The following kinds of events state something about ticks:
 
-        - "end": number of ticks that the sender executed until it ended. A number beyond the
-          duration of the scenario is reduced to that duration, because the site has certainly
-          ended.
-        - "join": first tick of a sender that joins the running session. An impossible tick is
-          ignored, because it would leave a gap up to that tick.
+        - "end": number of ticks that the sender executed until it ended. If the number exceeds
+          the number of ticks in the scenario, the number in the scenario is used instead.
+        - "join": first tick of a sender that joins the running session. The event is ignored if
+          this tick is after the end of the scenario.
         - `_OVERRUN`: ticks that the sender skipped because it was late.
-        - `LAST`: number of ticks of another site whose samples the sender had received before
-          that site was restarted.
+        - `LAST`: minimum number of ticks that another site executed before it was restarted,
+          known from the samples that the sender received from that site.
 
         Other events are ignored, as are events of members that are not sites.
 
@@ -313,7 +312,7 @@ class SessionAccounts:
                 yield channel, gap
 
     def add_expected_ticks(self, site: str, ticks: int) -> None:
-        """Updates the accounts for a site that executed at least a given number of ticks.
+        """Updates the accounts, given that a site executed at least `ticks` ticks.
 
         Records and statistics of these ticks that have not been received count as missing from
         now on.
@@ -366,8 +365,8 @@ class SessionAccounts:
         """Lists the message counts of a topic, separately for each start of its sender.
 
         Events are numbered from 0 again whenever their sender is restarted, so there is one
-        `Account` per start. All other messages continue their numbers, so their topics have a
-        single account.
+        `Account` per start. The numbers of all other messages continue after a restart, so
+        their topics have a single account.
 
         Args:
             topic: Topic of the channel, for which `open_channel` must have been called.
@@ -430,10 +429,10 @@ class SessionAccounts:
 
     @property
     def unknown_ends(self) -> list[str]:
-        """Names of the sites whose end is unknown.
+        """Names of the sites for which it is unknown when they ended.
 
-        A site publishes an "end" event when it ends, which states how many ticks it executed.
-        For the sites listed here, no such event has been received.
+        When a site ends, it publishes an event "end", which states how many ticks the site
+        executed. No "end" event has been received from the sites listed here.
         """
         return [site for site in self._rates_hz if site not in self._end_ticks]
 

@@ -108,7 +108,7 @@ class LogCheckResult(CheckReport):
         ]
 
     def check_signatures(self, key_file: Path, progress: Progress | None = None) -> None:
-        """Checks the signatures of the files too, and adds the result to the findings.
+        """Checks the signatures of the files as well, and adds the result to the findings.
 
         Args:
             key_file: Path of the public key file of a signer whom the user trusts.

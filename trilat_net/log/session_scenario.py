@@ -19,7 +19,7 @@ class _SiteRate(Protocol):
     def rate_hz(self) -> int:
         """Rate of the control loop of a site, in Hz.
 
-        Converts ticks to times: at 1000 Hz, tick 500 is at 0.5 s.
+        Used to convert ticks to times: at 1000 Hz, tick 500 is at 0.5 s.
         """
 
 
@@ -81,7 +81,7 @@ class SessionScenario(Protocol):
         """
 
     def layout(self, site: str) -> Layout:
-        """Returns the lengths of the vectors in a site's records, such as its number of joints.
+        """Returns the lengths of the vectors in a site's records, for example 2 joint angles.
 
         Readers of the log need these lengths to decode the records.
 

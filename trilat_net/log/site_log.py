@@ -422,8 +422,8 @@ class SiteLog:
     def prepare(self, *fields: str) -> None:
         """Decodes several fields of all records together, before they are accessed.
 
-        The fields are vectors such as joint angles. This is three times as fast as decoding
-        them one by one.
+        The fields are vectors such as joint angles. Decoding them together is three times as
+        fast as decoding them one by one.
 
         Args:
             fields: Names of the vectors, such as "q" and "tau".
@@ -520,7 +520,7 @@ class SiteLog:
         """Mapping from ticks to records.
 
         Used to compare two logs tick by tick, because either log may lack records. If several
-        records have the same tick, the last one counts.
+        records have the same tick, the last one is used.
         """
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
@@ -799,7 +799,7 @@ class SiteLog:
     def age_s(self, peer: str, rate_hz: int) -> Array:
         """Computes the age of the peer's sample that the control law used in each tick, in s.
 
-        `age_ns` defines the age.
+        See `age_ns` for the definition of the age.
 
         Args:
             peer: Name of the peer.
@@ -817,8 +817,8 @@ class SiteLog:
         """Yields the stamp and the delay of every sample of a peer, in order of their stamps.
 
         A sample that was sent but did not arrive has an infinite delay. It is left out if it
-        may have arrived in a tick whose record is missing. `Log.link_delays` defines the
-        delays.
+        may have arrived in a tick whose record is missing. See `Log.link_delays` for the
+        definition of the delay.
 
         Args:
             peer: Name of the sender.

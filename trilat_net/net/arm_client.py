@@ -105,12 +105,12 @@ class _SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends a message to a site and gives it the next sequence number.
+        """Sends a message with the next sequence number to a site.
 
         Args:
             kind: Class of the message.
-            **fields: Fields of the message other than the site, the boot and the sequence
-                number. Pass `sent_ns` to override the time stamp, which is otherwise the
+            **fields: Fields of the message other than `site`, `boot` and `n` (the sequence
+                number). Pass `sent_ns` to override the time stamp, which is otherwise the
                 current time.
 
         Returns:
@@ -124,7 +124,7 @@ class _SiteSender:
         return message
 
     def repeat(self, message: R) -> None:
-        """Resends a message with its original number, to show that the sender still runs.
+        """Resends a message with its original number, to show that the sender is still running.
 
         The site recognises the number and does not execute the message a second time.
 
@@ -549,8 +549,8 @@ class Hand(SiteClient):
             follows the message.
 
         Raises:
-            UsageError: The scenario's operator cannot be moved in this way, or a coordinate is
-                not finite.
+            UsageError: The scenario does not give the operator a target position, or a
+                coordinate is not finite.
         """
         return self._send("move", place_m)
 
@@ -564,8 +564,8 @@ class Hand(SiteClient):
             The number of the message, see `move`.
 
         Raises:
-            UsageError: The scenario's operator cannot be moved in this way, or an angle is not
-                finite.
+            UsageError: The scenario does not give the operator target angles, or an angle is
+                not finite.
         """
         return self._send("turn", angles_rad)
 
@@ -579,7 +579,7 @@ class Hand(SiteClient):
             The number of the message, see `move`.
 
         Raises:
-            UsageError: The scenario's operator does not apply forces, or a component is not
+            UsageError: The scenario does not give the operator a force, or a component is not
                 finite.
         """
         return self._send("push", force_n)
@@ -606,7 +606,7 @@ class Hand(SiteClient):
 
     @property
     def number(self) -> int:
-        """Number of this program's message that the arm followed in the newest record.
+        """Number of the message from this program that the arm follows in the newest record.
 
         Matches the number returned by `move`, `turn` or `push`. -1 if this program is not
         moving the arm.

@@ -164,7 +164,7 @@ class Bus(Protocol):
         """
 
     def announce(self, key: str) -> None:
-        """Announces this process to the others by declaring a Zenoh liveliness token.
+        """Announces this process to the other members by declaring a Zenoh liveliness token.
 
         The token disappears when the connection is closed or lost.
 
@@ -184,7 +184,7 @@ class Bus(Protocol):
         """
 
     def close(self) -> None:
-        """Closes the network connection. Other processes then see that this one has left.
+        """Closes the network connection. Other processes then see that this process has left.
 
         Repeated calls have no effect.
         """

@@ -48,8 +48,8 @@ class Clock(Protocol):
     def identity(self) -> str:
         """Returns a string that is equal in two processes if they share a monotonic clock.
 
-        Processes on one machine normally share it. Only then can their readings be compared
-        directly.
+        Processes on one machine normally share a monotonic clock. The readings of two processes
+        can be compared directly only if they share the clock.
         """
 
 
@@ -129,7 +129,8 @@ class SkewedClock:
     def monotonic_ns(self) -> int:
         """Returns the time of this deliberately inaccurate clock, in ns.
 
-        true time + offset + drift * (time since the clock was created)
+        This is the time of the base clock, plus the offset, plus the drift multiplied by the
+        time since this clock was created.
         """
         passed_ns = self._clock.monotonic_ns() - self._start_ns
         drift_ns = passed_ns * self._drift_ppb // NS_PER_S
@@ -145,8 +146,8 @@ class SkewedClock:
     def sleep_until(self, deadline_ns: int) -> None:
         """Sleeps until this clock reaches a given time.
 
-        The deadline is converted to a time of the base clock, which then does the sleeping.
-        When the base clock has advanced by p since the start, this clock reads
+        The deadline is converted to a time of the base clock, whose `sleep_until` is then
+        called. When the base clock has advanced by p since the start, this clock reads
 
             start + offset + p (1 + drift).
 

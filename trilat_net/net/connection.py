@@ -426,7 +426,7 @@ class Connection:
         with ExitStack() as stack:
 
             def connect(target: Connection) -> Bus | None:
-                """Opens a network connection, which is closed at the end of the `with` block.
+                """Opens a network connection, which is closed when `open_session` ends.
 
                 Returns None if `stopped` has returned True.
                 """

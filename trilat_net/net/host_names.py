@@ -32,7 +32,7 @@ def find_endpoint_addresses(endpoints: Iterable[Endpoint]) -> list[str]:
     with the key "locators".
 
     Args:
-        endpoints: Endpoints as strings, or such tables.
+        endpoints: Endpoints as strings, or as tables with the key "locators".
 
     Returns:
         All addresses, in the order of the endpoints.
@@ -58,8 +58,8 @@ def check_hosts(endpoints: Iterable[Endpoint]) -> None:
             tcp://arm.example:8786, or tables that group several endpoints.
 
     Raises:
-        UnknownHost: A host name cannot be resolved. The error refers to the first such
-            endpoint.
+        UnknownHost: A host name cannot be resolved. The error names the first endpoint with
+            this problem.
     """
     for address in find_endpoint_addresses(endpoints):
         match = _ENDPOINT.fullmatch(address)

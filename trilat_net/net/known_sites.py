@@ -94,7 +94,7 @@ def make_site_known(
     connection: "Connection",
     stop: bytes,
 ) -> Iterator[None]:
-    """Publishes the endpoints of a site in a file, which lets `trilat stop` find the site.
+    """Stores the endpoints of a site in a file, which lets `trilat stop` find the site.
 
     This is a context manager: the file exists while the site runs and is removed afterwards. If
     the file cannot be written, the site runs without it, and `trilat stop` searches the network
@@ -201,8 +201,9 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 
     Args:
         session: Name of the session.
-        connection: Network connection of this process. Sites in another mode are ignored, as
-            are sites with keys if this process has none, and sites without keys if it has some.
+        connection: Network connection of this process. Sites whose connection has a different
+            mode are ignored, as are sites with keys if this process has none, and sites without
+            keys if this process has keys.
 
     Returns:
         The endpoints, or None unless all sites of the session are known.
@@ -233,9 +234,9 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
         arguments: Command line after `trilat stop`.
 
     Returns:
-        The exit code of the command if all arms have been stopped or if the keys are missing.
-        Otherwise, the arguments for the full command, which then continues, for example by
-        searching the network for the remaining sites.
+        The exit code of the command if all arms have been stopped, if the keys are missing, or
+        if the user interrupted the command. Otherwise, the arguments for the full command,
+        which then continues, for example by searching the network for the remaining sites.
     """
     options, sites, is_simple = _parse_arguments(arguments)
     session = options["--session"]

@@ -131,7 +131,7 @@ def create_keys(
         members: Names of the sites, plus `recorder`, `operator` and `router` if they take part.
         hosts: Names and addresses on which members listen, in addition to those of the local
             machine.
-        days: Validity of the keys, in days.
+        days: Number of days for which the keys are valid.
 
     Returns:
         The folders of the members.
@@ -225,7 +225,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
         folder: Folder created by `create_keys`, including its folder `authority`.
         members: Members whose certificates are renewed. If empty, all members that have a
             folder.
-        days: Validity of the keys from now on, in days.
+        days: Number of days, from now on, for which the keys are valid.
 
     Returns:
         The folders whose certificates were renewed.
@@ -312,7 +312,7 @@ def add_keys(
         members: Names of the new members.
         hosts: Names and addresses on which the new members listen, in addition to those of the
             local machine.
-        days: Validity of the new keys, in days.
+        days: Number of days for which the new keys are valid.
 
     Returns:
         The folders of the new members.
@@ -527,7 +527,7 @@ def _write_all_keys(
         folder: Folder in which they are created.
         members: Names of the members.
         hosts: Names and addresses on which members listen.
-        days: Validity of the keys, in days.
+        days: Number of days for which the keys are valid.
     """
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
     authority_key = ec.generate_private_key(ec.SECP256R1())

@@ -56,10 +56,10 @@ def describe_member(
     scenario: str = "",
     **fields: object,
 ) -> Info:
-    """Composes the identity with which a member introduces itself to the rest of the session.
+    """Returns the identity with which a member introduces itself to the rest of the session.
 
-    The identity also contains the hash of the scenario, the name of the machine and the
-    identity of the clock.
+    In addition to the given fields, the identity contains the hash of the scenario, the name of
+    the machine and the identity of the clock.
 
     Args:
         member: Name of the member.
@@ -206,7 +206,8 @@ class Membership:
     Attributes:
         others: Mapping from name to identity for each other member that is present and has
             introduced itself.
-        alive: Boots of the members that are present, as strings.
+        alive: Boots of the members that are present, as strings. A boot is the random number
+            that identifies the start of a member's process.
         gone: Boots of the members that have disappeared, as strings.
     """
 
@@ -304,7 +305,7 @@ class Membership:
 
         Args:
             name: Name of the member.
-            boot: Boot of the former process.
+            boot: Random number that identifies the start of the former process.
         """
         info = self.others.get(name)
         return info is not None and info.boot != boot and str(boot) not in self.alive
@@ -312,10 +313,10 @@ class Membership:
     def list_running(self) -> list[Info]:
         """Lists the running sites that agree on who takes part in the session.
 
-        Every running site states the members that it has admitted and their boots. Two sites
-        agree if they state the same boots. The boot of this member is ignored in the
-        comparison, because some sites may have admitted this member already, and others not
-        yet.
+        Every running site states which members it has admitted, and the boot of each of them
+        (the random number that identifies the start of its process). Two sites agree if they
+        state the same boots. The boot of this member is ignored in the comparison, because some
+        sites may have admitted this member already while others have not.
 
         Returns:
             The identities of the sites that agree with the first running site, sorted by name.
@@ -490,7 +491,8 @@ class Epoch(NamedTuple):
     Attributes:
         mono_ns: The epoch on the monotonic clock of this process.
         unix_ns: The epoch in Unix time, as read from the leader's clock.
-        boots: Mapping from name to boot for each member.
+        boots: Mapping from the name of each member to its boot, the random number that
+            identifies the start of its process.
         epochs: Mapping from the name of each member to the epoch on its own monotonic clock.
             Empty for a recorder that joins late, which needs only its own clock.
         first: First tick that this site executes. 0 unless the site joins late.

@@ -180,7 +180,8 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
           the program, becomes "diverged".
         - `used` (the tick of the newest sample in use) is listed in the log by the name of the
           peer, and in the object by the index of the peer. -1 means that there is no sample.
-        - `mem` (the memory of the site) is empty unless it is complete.
+        - `mem` (the memory of the site) is copied only if it is complete, and is empty
+          otherwise.
 
         Args:
             peers: Names of the other sites, in scenario order.

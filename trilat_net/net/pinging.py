@@ -118,7 +118,8 @@ def answer_pings(
     def answer(_: bytes) -> bytes:
         """Returns the reply to a ping, with the times of the ping's arrival and of the reply.
 
-        The sender subtracts the time between the two from the measured round trip.
+        The sender of the ping subtracts the time between these two from the measured round trip
+        time.
         """
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()
@@ -323,10 +324,10 @@ class Pinger:
                 trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """Returns True if the clock offsets to all of the given members are known.
+        """Returns True if the clock offsets of all given members are known.
 
         Args:
-            boots: Boots of these members, the numbers that identify the starts of their
+            boots: Boots of the members, the numbers that identify the starts of their
                 processes.
         """
         return all(boot in self.trips and self.trips[boot].is_known for boot in boots)

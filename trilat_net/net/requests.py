@@ -186,7 +186,7 @@ class ArmMeasurement(DirectMessage, frozen=True, kw_only=True):
 class ArmEnable(DirectMessage, frozen=True, kw_only=True):
     """Reports whether the dead-man switch of an external arm is held.
 
-    The program of the switch sends it at least ten times per second.
+    The program of the switch sends this message at least ten times per second.
 
     Attributes:
         site: Name of the site.
@@ -235,7 +235,7 @@ class HandMessage(DirectMessage, frozen=True, kw_only=True):
 
 
 class PeerSeen(DirectMessage, frozen=True, kw_only=True):
-    """State of a peer's arm, as received by the site whose arm an operator's program moves.
+    """State of a peer's arm, as received by a site whose arm is moved by an operator's program.
 
     The state is delayed by the network. The fields are those of `PeerView`.
     """

@@ -120,8 +120,9 @@ class SessionJoin:
     def reason(self) -> str:
         """Explains why this site could not join a running session, for an error message.
 
-        This is either the message with which a running site has rejected it, or the names of
-        the running sites that have not admitted it. Empty if the reason is not known.
+        The explanation is either the message with which a running site has rejected this site,
+        or a sentence that names the running sites that have not admitted this site. Empty if
+        the reason is not known.
         """
         running = {info.member for info in self.membership.list_running()}
         silent_sites = sorted(running - self._admitted_by)
@@ -153,10 +154,10 @@ class SessionJoin:
     def poll(self) -> Epoch | None:
         """Receives and answers messages, and takes the next step towards the start.
 
-        If the session is already running and this member may join late, it joins. (A recorder
-        always may, since it only receives.) Otherwise the leader, which is the first site of
-        the scenario, proposes and confirms the epoch, and the other members agree to the
-        proposal and wait for the confirmation.
+        If the session is already running and this member may join late, it joins. A recorder
+        may always join late, since it only receives. Otherwise, the leader, which is the first
+        site of the scenario, proposes and confirms the epoch, and the other members agree to
+        the proposal and wait for the confirmation.
 
         A member that has agreed to a proposal may see others already running because they
         received the confirmation earlier. It still waits for the confirmation until the

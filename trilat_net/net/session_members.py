@@ -142,8 +142,8 @@ class SessionMembers:
             The identity of a member, as soon as its reply arrives.
 
         Raises:
-            SessionError: The time has run out, and none of the replies received could be
-                decoded.
+            SessionError: The time has run out, and members replied, but none of their replies
+                could be decoded.
         """
         self._query = self._make_query()
         self.unreadable.clear()

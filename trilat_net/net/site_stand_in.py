@@ -88,7 +88,8 @@ class SiteStandIn:
 
         Args:
             count_ticks: Function that returns how many ticks of the site have passed. It is
-                called only if an identity is encoded.
+                called only if the identity has to be encoded again, because a recently encoded
+                identity is reused.
         """
         while (query := self._identity_queries.poll()) is not None:
             query.reply(self._encode_identity(count_ticks))
@@ -109,7 +110,8 @@ class SiteStandIn:
     ) -> int | None:
         """Answers the oldest request from a recorder for messages that it has missed.
 
-        The recorder only accepts replies from the start of the site that it is following.
+        A recorder follows one start of the site's process, and only accepts replies from that
+        start.
 
         Args:
             find_boot: Function that returns the random number that identifies the start of the

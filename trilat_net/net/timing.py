@@ -93,13 +93,14 @@ class TickSchedule:
         """Adjusts the rate from tick `k` onwards to bring the schedule closer to the leader's.
 
         The new rate compensates for the drift between the clocks, and reduces the error with
-        time constant `_CORRECTION_TIME_S`. It is limited to `SLEW_LIMIT`.
+        time constant `_CORRECTION_TIME_S`. The deviation of the rate from that of the site's
+        clock is limited to `SLEW_LIMIT`.
 
         Args:
             k: Number of the tick. It must not be earlier than the tick of the previous
                 adjustment.
             error_ns: Lateness of the tick relative to the leader's schedule, in ns.
-            drift: Rate of the leader's clock relative to the site's clock, in ns/s.
+            drift: Drift of the leader's clock relative to the site's clock, in ns/s.
         """
         self._base_ns = self.due_ns(k)
         self._base_nominal_ns = k * NS_PER_S // self._rate_hz
@@ -248,7 +249,7 @@ class LinkTimingMonitor:
         self._floor: OffsetLimit | None = None
 
     def receive(self, sample: PeerSample, arrived_ns: int) -> int:
-        """Measures the delay of a sample in ns, and of the local samples that it acknowledges.
+        """Measures the delay of a received sample, and of local samples that it acknowledges.
 
         A sample contains echoes: for samples that the peer has received, the time of arrival on
         the peer's clock. The echo of a local sample gives the delay from this site to the peer.
@@ -670,8 +671,8 @@ class SiteTiming:
 
         Returns:
             The timing fields of `LinkStats`. The first fields are the lateness of this site
-            relative to the leader's schedule and the correction of its own rate. Each other
-            field is a dictionary that maps the name of the site at the other end of a link to
+            relative to the leader's schedule and the correction of its own rate. All other
+            fields are dictionaries that map the name of the site at the other end of a link to
             the measured quantity.
         """
         stats: dict[str, Any] = {
@@ -806,7 +807,7 @@ class LoopStats:
         The statistics contain sums since the start, and maxima since the last publication.
 
         Args:
-            late_us: Time by which the tick began late, in us.
+            late_us: Lateness of the beginning of the tick, in us.
             busy_us: Computing time of the previous tick, in us.
             skipped: Number of ticks that were skipped before this tick.
         """
@@ -821,8 +822,8 @@ class LoopStats:
     def is_due(self, k: int, skipped: int = 0) -> bool:
         """Returns True if the site publishes its statistics after tick `k`.
 
-        Statistics are published every `ticks_per_stats` ticks. If such a tick is skipped, they
-        are published after the next tick that is executed.
+        Statistics are published every `ticks_per_stats` ticks. If the tick of a publication is
+        skipped, the statistics are published after the next tick that is executed.
 
         Args:
             k: Number of the tick.

@@ -74,9 +74,9 @@ class KeyParts(NamedTuple):
 def presence_key(session: str, member: str) -> str:
     """Returns the key under which the presence of a member can be observed.
 
-    A process shows that it is present with a liveliness token, whose key contains the number of
-    its start. The returned key contains a wildcard that matches the tokens of all starts of the
-    member.
+    A process shows that it is present with a liveliness token, whose key contains the random
+    number that identifies the start of the process. In place of this number, the returned key
+    contains a wildcard, which matches the tokens of all starts of the member.
 
     Args:
         session: Name of the session.
@@ -86,7 +86,7 @@ def presence_key(session: str, member: str) -> str:
 
 
 def presence_token(session: str, member: str, boot: int) -> str:
-    """Returns the key of the token that shows that a particular start of a member is present.
+    """Returns the key of the liveliness token with which a process shows that it is present.
 
     Zenoh informs all members of the session when the token appears, and when the process that
     declared it has disappeared.
@@ -134,8 +134,8 @@ def parse_key(key: str) -> KeyParts | None:
         key: The key.
 
     Returns:
-        The names of the session, the member and the channel, plus the boot (the number of the
-        process start) for a token. None if the key belongs to another program.
+        The names of the session, the member and the channel, plus the boot (the number that
+        identifies the process start) for a token. None if the key belongs to another program.
     """
     root, _, rest = key.partition("/")
     parts = rest.split("/")
@@ -207,10 +207,10 @@ def skipped_numbers(
     skipped: int,
     rate_hz: int,
 ) -> tuple[int, int]:
-    """Returns the numbers that the messages of skipped ticks would have had.
+    """Returns the range of the message numbers that a site leaves unused by skipping ticks.
 
-    A site that is late may skip ticks, and publishes no messages for them. The numbers of these
-    messages remain unused and must not be counted as lost messages.
+    A site that is late may skip ticks, and publishes no messages for them. The unused numbers
+    must not be counted as lost messages.
 
     Args:
         channel: `STATE` for records, or `LINK` for statistics.
@@ -219,8 +219,9 @@ def skipped_numbers(
         rate_hz: Tick rate of the site.
 
     Returns:
-        The number of the first message after the skipped ticks, and the number of messages
-        published before them. Pass both to `Account.mark_unpublished`.
+        The end of the range, which is the number of the first message after the skipped ticks,
+        and the start of the range, which is the number of messages published before them. Pass
+        both to `Account.mark_unpublished`.
     """
     next_number = number_message(channel, tick, rate_hz)
     published = count_messages(channel, tick - skipped, rate_hz)

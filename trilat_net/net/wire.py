@@ -115,7 +115,7 @@ def encode_state(
         peers: Names of the site's peers, in the order of `used` in the output.
         output: Result of the tick, as computed by the simulation kernel.
         arrivals: Samples that the tick used as inputs, in order of arrival.
-        late_us: Time by which the tick began late, in us.
+        late_us: Lateness of the beginning of the tick, in us.
         busy_us: Computing time of the previous tick, in us.
         sent_ns: Time of sending, in ns since the epoch (the common start of the session) on the
             site's clock. If None, the nominal time of the tick is used, as in simulations.
@@ -353,8 +353,9 @@ def read_messages(inbox: Inbox, kind: type[M], layout: Layout | None = None) -> 
     Args:
         inbox: Queue of encoded messages.
         kind: Expected type of the messages.
-        layout: Expected numbers of joints and peers. Messages with other numbers are treated as
-            undecodable. If None, all numbers are accepted.
+        layout: Expected numbers of joints and peers, which determine the lengths of the vectors
+            in a message. Messages with vectors of other lengths are treated as undecodable. If
+            None, vectors of any length are accepted.
 
     Yields:
         The decoded messages, in order of arrival.

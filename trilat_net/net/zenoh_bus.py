@@ -60,12 +60,12 @@ def share_threads() -> None:
     """Makes Zenoh use one thread pool instead of five in sessions opened from now on.
 
     With several pools, threads in different pools wake each other up for every message, which
-    costs time. One thread would be enough for the work, but the pool has four: closing a
-    connection whose peer never received its last bytes blocks a thread for up to 10 s
-    (eclipse-zenoh/zenoh#1101), and the remaining threads then keep serving the other members.
+    costs time. One thread would be enough for the work, but the pool has four threads, because
+    closing a connection can block a thread for up to 10 s if the peer never received the last
+    bytes (eclipse-zenoh/zenoh#1101). The remaining threads then keep serving the other members.
 
-    A router must not call this function. If its output queue is full, it blocks the thread that
-    reads, and needs another pool to empty the queue.
+    A router must not call this function. If the output queue of a router is full, the router
+    blocks the thread that reads, and needs another pool to empty the queue.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _SHARED_POOL)
 
@@ -97,8 +97,8 @@ class _ZenohRing(Generic[T]):
         """Removes and returns the oldest usable entry, or returns None if there is none.
 
         An entry is a message or a reply. Entries for which `read` returns None, such as error
-        replies, are skipped. The queue of a query also counts as empty once all replies have
-        arrived.
+        replies, are skipped. Zenoh closes the queue of a query after the last reply; None is
+        then returned as well.
         """
         try:
             while (received := self._try_recv()) is not None:
@@ -401,7 +401,7 @@ class ZenohBus:
         )
 
     def announce(self, key: str) -> None:
-        """Announces this process to the others until its connection ends.
+        """Announces this process to the other members until its connection ends.
 
         Args:
             key: Key of the liveliness token through which other members see this member.

@@ -80,7 +80,7 @@ def allow_own_code(
     codes: Container[Any] | None = None,
     changed_from: ScenarioWithCode | None = None,
 ) -> AnyScenario:
-    """Permits user-written classes to run, because a user of this process has named them.
+    """Grants permission to run the user-written classes that a user of this process has named.
 
     Code that nobody has named or permitted is rejected, because a scenario from elsewhere may
     name harmful code.
@@ -89,8 +89,9 @@ def allow_own_code(
         scenario: Scenario that names the code.
         codes: Classes that the user named, for example "package.module:Law". If None, the user
             wrote the complete scenario, so all its code may run.
-        changed_from: Scenario that the user modified to get this scenario. Code that may run
-            there may also run here, with its new arguments. None if there is no such scenario.
+        changed_from: Scenario that the user modified to get this scenario. Code that was
+            permitted in that scenario is also permitted in the new one, with its new arguments.
+            None if the scenario was not modified in this way.
 
     Returns:
         The same scenario.
@@ -112,7 +113,7 @@ def allow_own_code(
 
 
 def import_named_class(code: str, path: str) -> Any:
-    """Imports a control law that a user of this process has named, and so permitted to run.
+    """Imports a control law that a user of this process has named and thereby permitted.
 
     Args:
         code: Module and class, as in "mylaws:Spring".
@@ -147,10 +148,11 @@ def allow_logged_code(
     other_version: bool = False,
     remember: bool = False,
 ) -> None:
-    """Permits code that a log names to run, if a person has permitted it.
+    """Grants permission to run user-written code named in a log, if a person has allowed it.
 
     A log may have an unknown author, so its code does not run without permission. A person
-    permits code by naming its file now, or has stored a permission earlier. See `open_log`.
+    either permits the code now, by naming its file, or has stored a permission earlier. See
+    `open_log`.
 
     Args:
         scenario: Scenario of the log, which names the code.
@@ -160,7 +162,7 @@ def allow_logged_code(
 
     Raises:
         UsageError: A file does not belong to code that the log names, or is not the version
-            that ran. Also raised if an option requires a file and none is named.
+            that ran. Also raised if `other_version` or `remember` is set but no file is named.
         ScenarioError: A file cannot be read, or does not define the class that the log names.
             No code has run.
     """
@@ -308,9 +310,9 @@ class LoggedUserLaw(NamedTuple):
         allowed: True if the file may run with these arguments.
         file: The file that a person permitted, or else the file that Python's import system
             finds for the module. None if there is no such file.
-        changed: Text about the hashes if the file differs from the file that ran. Otherwise
-            empty.
-        other_settings: Text about the differences if the code was permitted with other
+        changed: Phrase that compares the hashes, if the file differs from the file that ran.
+            Otherwise empty.
+        other_settings: Phrase that states the differences, if the code was permitted with other
             arguments. Otherwise empty.
     """
 

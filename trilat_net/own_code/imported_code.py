@@ -55,7 +55,7 @@ Its arguments are the tick and the call, a function without arguments.
 def call_directly(_k: int, function: Callable[[], Any]) -> Any:
     """Calls user-written code without a time limit.
 
-    In a live session, user-written code must not delay the control loop, so its calls are
+    In a live session, user-written code must not delay the control loop, so calls to it are
     monitored by a `Watch`. In virtual time, where no other process waits for the result, this
     function takes its place.
 
@@ -183,7 +183,7 @@ class CodeKey(NamedTuple):
         arguments were permitted, the one with the fewest differences is used.
 
         Returns:
-            Part of a sentence. Empty if the code was not permitted with any arguments.
+            Part of a sentence. Empty if the code was not permitted with other arguments.
         """
         allowed_settings = {
             allowed.settings
@@ -283,7 +283,7 @@ what differs if code is rejected. They permit nothing.
 
 @contextmanager
 def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
-    """Permits code with any arguments, inside the `with` block.
+    """Permits code to run with any arguments, inside the `with` block.
 
     Normally, a permission applies only to certain arguments of a class. A parameter study
     varies the arguments itself, so it needs a wider permission.
@@ -368,7 +368,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def read_default_settings(self) -> dict[str, Any]:
-        """Returns the defaults of the class's arguments, used if the scenario omits them.
+        """Returns the default values of the arguments that the scenario may omit.
 
         They are read from the file of the law, which is not run. A default that is not a
         literal is returned as its Python source text.

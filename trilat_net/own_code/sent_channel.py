@@ -44,7 +44,7 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
 
 
 def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
-    """Returns the vectors that a law's class declares in a file, without running the file.
+    """Returns the vectors that a law sends, according to its file, without running the file.
 
     The scenario needs these vectors before the code has been permitted to run.
 

@@ -100,8 +100,8 @@ def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
 def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
     """Yields a table of the ten most important metrics of a run, each with its subject.
 
-    The subject is, for example, the site with the largest value, or "every site" if the value
-    is the same at all sites.
+    The subject states to what the value applies, for example the site with the largest value,
+    or "every site" if the value is the same at all sites.
 
     Args:
         metrics: All metrics of the run.

@@ -165,12 +165,13 @@ class CertificateLine(NamedTuple):
 
 
 def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
-    """Returns the verdict of a certificate followed by its reasons, each as a marked sentence.
+    """Returns the verdict of a certificate and the reasons for it, one marked sentence each.
 
-    The possible reasons are the energy function V of the stability proof, the end of the run,
-    the energy balance, energies declared by control laws, the characteristic roots, the twins
-    (repeated runs with a small push), and the log itself. Reasons that are not available for
-    the run are omitted.
+    Each sentence has a mark such as "ok" or "FAIL", see `CertificateLine`. The reasons can
+    concern the energy function V of the stability proof, the end of the run, the energy
+    balance, energies declared by control laws, the characteristic roots, the twins (repeated
+    runs with a small push), and the log itself. Reasons that are not available for the run are
+    omitted.
 
     Args:
         certificate: Stability certificate of the run.

@@ -130,8 +130,8 @@ class ChartBuilder:
     def build(self) -> _PageCharts:
         """Computes all charts of the page: overview, motion of the arms, and timing.
 
-        A chart without any curves is omitted, for example the estimates of a law that estimates
-        nothing. The page lists the titles of omitted charts by section.
+        A chart without any curves is omitted, for example the chart of the estimates if the
+        control laws estimate nothing. The page lists the titles of omitted charts by section.
 
         Returns:
             The page data, including the titles of omitted charts.

@@ -50,7 +50,7 @@ class Conclusion(CheckReport):
         table: Table with one row per arm.
         notes: Lines about the stability proof and about notable facts of the run, such as
             changed settings or messages from a user's control law.
-        paths: Log files, and files that were written.
+        paths: Paths of the log files and of the files that were written.
     """
 
     verdict: CertificateLine
@@ -145,7 +145,7 @@ def conclude(
 
     Raises:
         LogError: A record cannot be read.
-        RunFailed: The process that executes the log was terminated.
+        RunFailed: The process that re-executes the log was terminated.
     """
     # Importing Matplotlib takes a second, which `trilat verify` need not wait for.
     from .figures.age_and_lateness import explain_missing_loop_times

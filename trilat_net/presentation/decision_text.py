@@ -60,10 +60,10 @@ def _describe_span(roots: stability_decision.LoopRoots) -> str:
 def describe_tick_span(
     span_s: float | None, deviation_per_s: float | None, *, repeats: bool
 ) -> str:
-    """Returns a clause on the time span for which the roots of a sampled loop were computed.
+    """Returns a clause that states the time span over which the roots of a loop were computed.
 
-    If the ticks of the controllers are not all alike, the roots describe a span of several
-    ticks.
+    The loop is executed in ticks. If the ticks are not all alike, the roots describe how the
+    motion changes over a span of several ticks.
 
     Args:
         span_s: The time span, in s. None if all ticks are alike.
@@ -84,7 +84,7 @@ def describe_tick_span(
 
 
 def describe_left_out(roots: stability_decision.LoopRoots) -> str:
-    """Returns a phrase about programs whose reaction to the arms the linear analysis ignores.
+    """Returns a phrase about programs whose reaction to the arms is not part of the analysis.
 
     A program that moves an arm can run arbitrary code, which cannot be linearised. The phrase
     is empty if there is no such program.

@@ -31,20 +31,21 @@ _SUFFIX = ".rviz"
 
 
 def write_rviz_config(log: Path, *, force: bool = False) -> Path:
-    """Writes a configuration for RViz, the 3D viewer of ROS 2, that shows the arms of a log.
+    """Writes a file that configures RViz, the 3D viewer of ROS 2, to show the arms of a log.
 
     RViz shows the arms while the live bridge publishes the session, or while the bag is played
     back.
 
     Args:
         log: Path of the log or bag.
-        force: True to allow replacing an existing file.
+        force: True to replace an existing file.
 
     Returns:
-        The path of the configuration, which is next to the log.
+        The path of the file, which is next to the log.
 
     Raises:
-        UsageError: No topic contains the description of an arm, or the configuration exists.
+        UsageError: No topic contains the description of an arm, or the file already exists and
+            `force` is False.
         LogError: The log cannot be read.
     """
     path = log.with_suffix(_SUFFIX)
@@ -58,7 +59,7 @@ def write_rviz_config(log: Path, *, force: bool = False) -> Path:
 
 
 def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
-    """Returns settings with which the viewer RViz shows the arms of a session or a bag.
+    """Returns a configuration for the 3D viewer RViz to show the arms of a session or a bag.
 
     Args:
         topics: Maps the full name of each topic, which begins with "/", to its description.

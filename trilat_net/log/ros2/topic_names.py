@@ -72,9 +72,9 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         joints: Names of the joints in the robot's messages, in scenario order. If empty, the
             names of the scenario are used.
         controller: The same names in the order in which the robot's controller expects its
-            commands. If empty, scenario order is used.
-        safe: Command sent to the controller while the arm brakes, one number per joint in the
-            order of the controller. If empty, zeros are sent.
+            commands (controller order). If empty, scenario order is used.
+        safe: Command sent to the controller while the arm brakes, one number per joint in
+            controller order. If empty, zeros are sent.
     """
 
     joints: list[str] = []
@@ -87,8 +87,8 @@ class TopicTable(NamedTuple):
 
     Attributes:
         names: Maps the trilat-net name of each topic to its ROS 2 name.
-        of_site: For each site with names of its own, maps the trilat-net name of a topic to its
-            ROS 2 name.
+        of_site: For each site that has its own topic names, maps the trilat-net name of a topic
+            to its ROS 2 name.
         robots: Maps the names of sites with a real robot to the settings of the robot.
     """
 
@@ -97,18 +97,19 @@ class TopicTable(NamedTuple):
     robots: Mapping[str, RobotTable] = {}
 
     def refuse_other_robots(self, scenario: Scenario) -> None:
-        """Raises UsageError unless each robot belongs to a site with a matching external arm.
+        """Raises UsageError if robot settings do not fit the external arms of the scenario.
 
-        An external arm is a real arm, or a simulation in another program, and settings of a
-        robot only make sense for a site that has one. Settings that equal the defaults are
-        tolerated at other sites of the scenario, because they have no effect.
+        An external arm is a real arm, or a simulation in another program. Robot settings only
+        make sense for a site with an external arm. For any other site of the scenario, settings
+        that equal the defaults are tolerated, because they have no effect.
 
         Args:
             scenario: Scenario of the session.
 
         Raises:
-            UsageError: A site without an external arm has robot settings, the scenario has no
-                such site, or the robot does not have as many joints as the arm of its site.
+            UsageError: Robot settings are given for a site that is not in the scenario or has
+                no external arm, or the robot does not have as many joints as the arm of its
+                site.
         """
         for site, robot in self.robots.items():
             has_external_arm = site in scenario.outside

@@ -1,4 +1,4 @@
-"""Writes the curves of a run for general viewers, with fewer points than the log.
+"""Writes the curves of a run for general-purpose viewers, with fewer points than the log.
 
 An arm typically publishes its state 1000 times a second, more than a viewer such as Foxglove
 can draw smoothly. The states are therefore collected in buckets, intervals of equal length. A
@@ -32,7 +32,7 @@ from .ros2_messages import Record, Ros2Channel, SignalRow
 SLOW_VIZ_HZ = 10.0
 """Rate of the messages with exogenous torque, estimate and mode, in Hz.
 
-If every record results in a message with the joints, the same applies to these channels.
+If every record results in a message about the joints, the same applies to these channels.
 """
 MAX_PENDING_BYTES = 1 << 13
 """Maximum size of a site's messages that are still to be written, in bytes, for two joints."""
@@ -86,7 +86,7 @@ class _BucketOutput:
     def flush(self, log_ns: int) -> None:
         """Writes the second message of a time interval, if it is still pending.
 
-        `add` kept this message back, so that messages are evenly spaced in time.
+        `add` held this message back, so that messages are evenly spaced in time.
 
         Args:
             log_ns: Arrival time to store in the log with the message, in Unix time, in ns.
@@ -97,8 +97,8 @@ class _BucketOutput:
     def write_all(self, rows: Sequence[StampedRow], log_ns: int) -> None:
         """Writes all rows of a time interval at once.
 
-        Used for an interval whose records arrived late. Otherwise `add` spreads the rows over
-        time.
+        Used for an interval whose records arrived late. For all other intervals, `add` spreads
+        the rows over time.
 
         Args:
             rows: The rows with their times.
@@ -111,7 +111,7 @@ class _BucketOutput:
 class _SiteBuckets:
     """The buckets of one site.
 
-    A fast bucket contains records, and becomes two messages with the joints. A slow bucket
+    A fast bucket contains records, and becomes two messages about the joints. A slow bucket
     contains the rows of several fast buckets, and becomes two messages with the other curves.
 
     Args:
@@ -441,18 +441,18 @@ def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> li
 
 
 class VizChannels:
-    """Writes messages for general viewers to a log, next to the messages of the session.
+    """Adds messages for general-purpose viewers to the log of a session.
 
-    Viewers such as Foxglove cannot decode or draw all messages of a session. They are given
-    standard ROS 2 messages with fewer points, which preserve the minimum and maximum of each
-    interval.
+    Viewers such as Foxglove cannot decode or draw all messages of a session. For these viewers,
+    the log contains additional standard ROS 2 messages with fewer points, which preserve the
+    minimum and maximum of each curve in each interval.
 
     Args:
         scenario: Scenario of the session.
         session: Name of the session.
         epoch_unix_ns: Unix time of tick 0, in ns; 0 in virtual time.
-        views_hz: Rate of the messages with the joints, in Hz. With `FULL_RATE_HZ`, one message
-            is written per record.
+        views_hz: Rate of the joint messages, in Hz. With `FULL_RATE_HZ`, one message is written
+            per record.
         put: Function that writes a message to the log.
 
     Attributes:
@@ -514,8 +514,8 @@ class VizChannels:
     def finish(self, log_ns: int) -> None:
         """Writes the remaining messages for viewers at the end of the log.
 
-        Otherwise, the messages about a time interval are written only after the interval has
-        ended.
+        The messages about a time interval are normally written after a later interval has
+        begun, so the messages about the last interval are still waiting to be written.
 
         Args:
             log_ns: Arrival time of the last message of the session in Unix time, in ns.
@@ -524,7 +524,7 @@ class VizChannels:
             buckets.finish(log_ns)
 
     def open_channels(self, file: McapWriter) -> ros2_messages.StandardChannels:
-        """Returns the channels of a file that viewers such as Foxglove display.
+        """Returns the channels for viewers such as Foxglove in one file of a log.
 
         A channel is registered in the file only when its first message is written.
 
@@ -550,8 +550,8 @@ def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
 
     Args:
         scenario: Scenario of the session.
-        views_hz: Rate of the messages with the joints, in Hz, see `VizChannels`. If 0, the log
-            contains no messages for viewers.
+        views_hz: Rate of the joint messages, in Hz, see `VizChannels`. If 0, the log contains
+            no messages for viewers.
 
     Returns:
         The function, or None if `views_hz` is 0.

@@ -138,7 +138,8 @@ def has_varying_delay(log: Log) -> bool:
         log: Log of the run.
 
     Returns:
-        True if at least one link does not have a single constant delay.
+        False if every link delays all its samples by the same constant time and loses none, and
+        True otherwise.
     """
     links = Timeline(log).stated_links.values()
     return not all(link.has_one_constant_delay for link in links)
@@ -157,7 +158,10 @@ class DelayAxis(NamedTuple):
 
     @property
     def is_logarithmic(self) -> bool:
-        """True if the axis is logarithmic, because a few values are far above the rest."""
+        """True if the axis is logarithmic.
+
+        An axis is logarithmic if a few values are far above the rest.
+        """
         return bool(self.x_ms[0] > 0.0)
 
     @classmethod
@@ -362,7 +366,8 @@ def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
 def explain_missing_loop_times(log: Log) -> str:
     """Returns the reason why a log has no figures of control loop timing.
 
-    Only runs in real time measure how late a tick started and how long it took.
+    Control loop timing consists of how late each tick started and how long it took. These times
+    are only measured in runs that are executed in real time.
 
     Args:
         log: Log of the run.

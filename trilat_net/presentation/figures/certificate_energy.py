@@ -76,8 +76,8 @@ def draw_functional(
 
     V decreases if the controllers dissipate more energy than the operators supply. From top to
     bottom, the panels show V and the contribution of each site; the components of V;
-    dissipation and work; and the residual of the balance, which these energies do not explain.
-    If there is no balance, the figure shows the reason.
+    dissipation and work; and the residual of the balance, the part that these energies do not
+    explain. If there is no balance, the figure shows the reason.
 
     Args:
         log: Log of the run.
@@ -133,13 +133,13 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
 def draw_observed_energy(
     log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
 ) -> Figure:
-    """Draws the energies that the control laws keep account of, in J over time.
+    """Draws the energies that the control laws keep track of, in J over time.
 
     Some control laws ensure stability by never returning more energy than they received. There
-    is one panel per kind of energy: the energy in transit between sites, the part of it that
-    the receivers know, the energy stored by the laws, and the energy that the arms gave to the
-    laws, together with the energy that the laws dissipated. Curves of energy in transit use the
-    colour of the receiving site.
+    is one panel per kind of energy: the energy in transit between sites, the part of this
+    energy that the receivers know of, the energy stored by the laws, and the energy that the
+    arms gave to the laws, together with the energy that the laws dissipated. Curves of energy
+    in transit use the colour of the receiving site.
 
     Args:
         log: Log of the run.

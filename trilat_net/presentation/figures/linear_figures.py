@@ -172,7 +172,7 @@ def _convert_to_hz(w_rad_s: Array) -> Array:
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws over frequency whether the loop is passive, and stable with any passive operators.
+    """Draws measures of passivity and of stability with passive operators, over frequency.
 
     The upper panel shows the smallest eigenvalue of Y + Y^H divided by its bound 2 norm(Y),
     where Y is the admittance matrix of the ports (velocity per force). A negative value means
@@ -371,7 +371,8 @@ def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
     """Draws the measured one-way delays of a network, in ms, for several loads and transports.
 
     Each load combines a message size in bytes with a message rate per second. The load of the
-    benchmarked scenario is shaded. Transports are the network protocols that were measured.
+    benchmarked scenario is shaded. The transports are the network protocols whose delays were
+    measured.
 
     Args:
         facts: Results of the network benchmark, from `NetworkBenchmark.to_dict`.
@@ -512,8 +513,8 @@ def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
     """Draws the largest stable stiffness of an arm that follows another arm over delayed links.
 
     The horizontal axis is the delay. The vertical axis is the stiffness K of a joint divided by
-    its inertia, in 1/s^2. Markers show the chosen gains, and the simulated runs that checked
-    the largest stable stiffness.
+    its inertia, in 1/s^2. Markers show the chosen gains, and the simulated runs with which the
+    largest stable stiffness was checked.
 
     Args:
         facts: Results of the search for gains, from `ArmGains.to_dict`.
