@@ -43,7 +43,7 @@ def simulate(
     duration_s: float | None = None,
     seed: int | None = None,
 ) -> SimulatedLog:
-    """Simulates a scenario in virtual time and returns the log; the command is `trilat sim`.
+    """Simulates a scenario in virtual time, as `trilat sim` does, and returns the log.
 
     In virtual time, a single process simulates all arms and the network as fast as possible. A
     run that diverges triggers a warning, and `log.diverged_s` holds the time of divergence.
@@ -82,7 +82,7 @@ def export(
 ) -> Path:
     """Exports a log to a format that other tools can read, and returns the output path.
 
-    The command is `trilat log export`.
+    The command `trilat log export` does the same.
 
     >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
     'run.npz'
@@ -119,7 +119,7 @@ def verify(
 ) -> LogCheckReport:
     """Recomputes a run from its log and checks that every computed number matches bit for bit.
 
-    The command is `trilat verify`.
+    The command `trilat verify` does the same.
 
     >>> tn.verify(tn.simulate("two_sites", duration_s=0.1)).passed
     True
@@ -153,10 +153,10 @@ def certify(
     own_laws: bool = False,
     twins: int | None = None,
 ) -> Certificate:
-    """Decides whether a recorded run was stable; the command is `trilat certify`.
+    """Decides whether a recorded run was stable, as `trilat certify` does.
 
-    The verdict is "stable", "settled", "not stable" or "open" (none of the others could be
-    shown).
+    The verdict is "stable", "settled", "not stable", or "open" if none of the other three could
+    be established.
 
     >>> print(tn.certify(tn.simulate("free")).stability)
     stable
@@ -201,17 +201,17 @@ def twin(
     Args:
         log: The log, or its path.
         at_s: Time of the pushes, in s.
-        push: Sizes by target, as in `{"m1.q1": 1e-6}`, with one twin per push. A target is a
-            joint's angle, `m1.q1`, a joint's speed, `m1.qd1`, an estimate, `m1.theta1`, or
-            several quantities in a random direction, `m1.q` or `q`. By default the pushes are
-            those of `certify`. If these default pushes are made at 0 s, the growth of their
-            effects is judged as in `certify`.
-        delta: Range of sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+        push: Size of each push, keyed by its target, as in `{"m1.q1": 1e-6}`. There is one twin
+            per push. A target is a joint's angle, `m1.q1`, a joint's speed, `m1.qd1`, an
+            estimate, `m1.theta1`, or several quantities in a random direction, `m1.q` or `q`.
+            By default the pushes are those of `certify`. If these default pushes are made at
+            0 s, the growth of their effects is judged as in `certify`.
+        delta: Range of sizes for a single push, as in "1e-9:1e-3", with one twin per decade.
 
     Raises:
         UsageError: A target does not exist, or the time or the range of sizes is invalid.
         LogError: The log cannot be read, or its run cannot be repeated.
-        CodeWithheld: The code of a law of the log may not be executed.
+        CodeWithheld: The run uses a control law whose code may not be executed.
     """
     from ..analysis import PushedTwins
 
@@ -219,9 +219,10 @@ def twin(
 
 
 def metrics(log: AnyLog) -> LogMetrics:
-    """Computes the metrics of tracking, effort, energy, force sharing and the network of a run.
+    """Computes metrics of a run: tracking, effort, energy, force sharing and network.
 
-    The command is `trilat metrics`. docs/reference/metrics.md has the formula of every metric.
+    The command `trilat metrics` does the same. docs/reference/metrics.md has the formula of
+    every metric.
 
     >>> found = tn.metrics(tn.simulate("two_sites", duration_s=0.1))
     >>> found.sites["m"]["rms_error_rad"].value > 0.0
@@ -256,7 +257,7 @@ def choose_report_folder(log: Path) -> Path:
 def report(
     log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
 ) -> "Conclusion":
-    """Writes a report of a log, with figures and a summary; the command is `trilat report`.
+    """Writes a report of a log, with figures and a summary, as `trilat report` does.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.report(path, "report").passed
@@ -302,7 +303,7 @@ def linear(
     """Linearises the closed loop of all arms about its equilibrium and analyses its stability.
 
     The analysis covers the characteristic roots, the stability margins, passivity, and the
-    impedances that operators feel. The command is `trilat linear`.
+    impedances that operators feel. The command `trilat linear` does the same.
 
     >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
     'unstable'
@@ -312,7 +313,8 @@ def linear(
             tables, `Scenario`, or log. For a log, the loop is analysed as it was at the end of
             the run, after all commands.
         set: Overrides of scenario settings, for example `{"control.d": 0.9}`.
-        pose: Joint angles of all sites, in rad. Default: those at the end of the run.
+        pose: Joint angles, in rad, of an equilibrium that all arms share. Default: the
+            equilibrium nearest to the end of the run.
         roots: Number of characteristic roots to compute (the complex exponents of the loop's
             modes).
         over: Ranges of settings to search for stability boundaries (values at which the
@@ -357,7 +359,7 @@ def view(
     rviz: bool = False,
     viewer: str | None = None,
 ) -> None:
-    """Opens a log in the Rerun viewer; the command is `trilat log view`.
+    """Opens a log in the Rerun viewer, as `trilat log view` does.
 
     Blocks until the viewer is closed.
 

@@ -1,7 +1,7 @@
 """Runs a complete session on one machine, with one process per site and a recorder.
 
 A session is a run in which several robot arms are coupled over a network. A site is a process
-that runs one arm and its control loop. The recorder is a process that writes the log of the
+that runs the control loop of one arm. The recorder is a process that writes the log of the
 session. `run_demo` runs such a session for the command `trilat demo`, and `run` does so for
 Python programs.
 
@@ -67,7 +67,7 @@ class SessionResult:
     Attributes:
         log: Path of the log. The file exists only if the session has begun.
         problems: One sentence per failure, in order of occurrence.
-        interrupted: Number of the signal that ended the session, or 0 if none did.
+        interrupted: Number of the signal that ended the session, or 0 if no signal ended it.
         exit_code: Exit code for the command. It indicates whether the run failed or the log
             could not be written to the disk.
     """
@@ -106,9 +106,9 @@ def run_demo(
         console: Terminal of the user.
         attend: Function that watches the session, for example to serve a web page, and may end
             the session. `None` if there is no such function.
-        begins: Function that returns True once the session may begin. Until then, for at most
-            `WAIT_S`, the sites wait for the recorder. The session begins a second or two later.
-            If `None`, the session begins at once.
+        begins: Function that returns True once the session may begin. The recorder is started
+            only then, and the session begins a second or two later. The sites wait for the
+            recorder for at most `WAIT_S`. If `None`, the recorder is started at once.
 
     Returns:
         The outcome of the session. If the session has begun, the log is valid.
@@ -394,7 +394,8 @@ def _end_group(
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
     """Runs the starter process, from which the processes of a session are forked.
 
-    Forked processes start quickly, because all modules are imported and all code is compiled.
+    Forked processes start quickly, because the starter has already imported all modules and
+    compiled all code.
     The function is in this module because the forks need most of the module's imports. As with
     `os.fork`, it returns in every process: in each fork, which then runs its command, and
     finally in the starter, after the requesting process has disappeared.

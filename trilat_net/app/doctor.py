@@ -1,9 +1,9 @@
 """Checks whether this machine is ready for a session, and suggests a fix for each problem.
 
-A session consists of processes (sites) that run arms at 1000 ticks per second and exchange
+A session consists of processes (sites) that control arms at 1000 ticks per second and exchange
 their states over the network. The checks cover the keys, the network endpoints, the clocks, the
 operating system's real-time privileges, the tick rate that this machine achieves, the disk and
-the processors. The command is `trilat doctor`.
+the processors. The command `trilat doctor` runs the checks.
 
 Each check yields a finding, which states the result and, if there is a problem, a remedy. The
 checks do not modify this machine. The real-time privileges and the tick rate are measured in a
@@ -593,7 +593,7 @@ class MachineExamination:
 
     @staticmethod
     def check_rate() -> DoctorFinding:
-        """Measures the highest rate, in Hz, at which a control loop is punctual here.
+        """Measures the highest rate, in Hz, at which this machine runs a control loop on time.
 
         The rates in `RATES_HZ`, such as 1000 Hz, are tried in turn, for `REHEARSAL_S` each,
         until the loop starts its periods on time.

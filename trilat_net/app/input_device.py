@@ -25,7 +25,7 @@ class DeviceState(NamedTuple):
     Attributes:
         position_m: Position in m. The origin is arbitrary, because only changes matter.
         velocity_m_s: Velocity in m/s.
-        buttons: Mapping from button name to True if the button is pressed.
+        buttons: For each button, keyed by its name, True if it is pressed.
     """
 
     position_m: Vector
@@ -37,8 +37,8 @@ class Device(Protocol):
     """Interface of an input device with which a person moves a robot arm.
 
     An example is a haptic device, whose motion moves the target that the arm follows. The
-    device is read `rate_hz` times a second. To support another device, write a class with these
-    methods.
+    device is read `rate_hz` times a second. To support another device, write a class with the
+    methods of this class.
 
     A device is a context manager. If the connection to the device is lost, the `with` block is
     left and entered again.
@@ -69,7 +69,7 @@ class Device(Protocol):
         """
 
     def render(self, force_n: Vector) -> None:
-        """Applies a force in N, using the device's motors, to the person who holds the handle.
+        """Exerts a force, in N, on the hand that holds the handle, using the device's motors.
 
         For a device without motors, this method does nothing.
 

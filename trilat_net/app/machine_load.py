@@ -59,8 +59,8 @@ class _ProcessorTimes(NamedTuple):
     def parse(cls, text: str) -> "_ProcessorTimes":
         """Parses the idle and total processor times from the content of /proc/stat on Linux.
 
-        The first line of the file is used, which is the sum over all processors, see
-        proc_stat(5).
+        The times are read from the first line of the file, which contains the sums over all
+        processors; see proc_stat(5).
 
         Args:
             text: Content of the file.

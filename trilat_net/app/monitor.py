@@ -51,9 +51,9 @@ LOUD_EVENTS = frozenset(
 
 
 class StatusRow(dict[str, str]):
-    """One site's row in the table, as a mapping from column heading to cell text.
+    """Row of a table of sites, as a mapping from column heading to cell text.
 
-    Cells whose content is unknown are empty.
+    The row shows the status of one site. A cell is empty if its content is unknown.
     """
 
     @classmethod
@@ -252,8 +252,8 @@ class SessionDisplay:
     def due(self) -> bool:
         """True if enough time has passed since the last update of the display.
 
-        A table in a terminal is updated more often than lines in a file. The rate is limited,
-        because drawing takes time and nobody could follow faster changes.
+        The table in a terminal is updated more often than lines are written to a file. The rate
+        is limited, because drawing takes time and nobody could follow faster changes.
         """
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
@@ -281,7 +281,7 @@ class SessionDisplay:
         Args:
             title: Title of the table.
             rows: Rows of the sites.
-            alarms: Pairs of site name and alarm, for each current alarm.
+            alarms: The current alarms, as pairs of site name and alarm.
         """
         self._updated_ns = self._clock.monotonic_ns()
         if self._live is None:  # the output is not a terminal

@@ -3,7 +3,8 @@
 This process (the near end) sends messages to a process on another machine (the far end, started
 with `trilat ping --answer`), which returns each of them immediately. Round-trip times and
 message losses are measured for several message sizes, message rates and protocols, and compared
-with the delay and loss that the scenario tolerates. The command is `trilat ping --benchmark`.
+with the delay and loss that the scenario tolerates. The command `trilat ping --benchmark` runs
+the benchmark.
 
 Invariant:
     - The benchmark uses the network as a session would. Its messages have the size, rate,
@@ -89,7 +90,8 @@ def _parse_header(payload: bytes) -> tuple[int, ...] | None:
 def answer_benchmarks(bus: Bus, member: str) -> None:
     """Returns each test message of a network benchmark to its sender, until the bus is closed.
 
-    Runs at the far end, while the near end measures the round-trip times.
+    This function runs at the far end. The near end sends the messages and measures their
+    round-trip times.
 
     Args:
         bus: Network connection of the far end.
@@ -114,7 +116,7 @@ def answer_benchmarks(bus: Bus, member: str) -> None:
 
 
 class NearEnd:
-    """Sends messages to the far end, and measures when they come back.
+    """Sends test messages to another process, the far end, and measures their round-trip times.
 
     The far end returns each message immediately, so round-trip times can be measured with the
     near end's clock alone.
@@ -349,14 +351,15 @@ class NetworkNeeds(NamedTuple):
         playout_ms: Smallest play-out delay of the links. A play-out delay holds each sample
             until it reaches a fixed age, which turns varying network delays into a constant
             one.
-        held_ms: Shortest time for which a link holds its samples, due to a play-out delay or to
-            a constant delay set in the scenario.
-        in_use_ms: The part of the age of the samples in use that is caused by the scenario's
-            links. `None` if the linear theory does not cover the scenario.
-        stable_ms: Intervals of the delay of all links for which the control loop is stable.
-            `None` if the linear theory does not cover the scenario.
-        words: Explanation of these intervals for the user, or the reason why the theory does
-            not cover the scenario.
+        held_ms: Shortest time for which any link holds its samples, due to a play-out delay or
+            to a constant delay set in the scenario.
+        in_use_ms: Largest age of the samples in use that results from the delays set in the
+            scenario. `None` if the linear theory does not cover the scenario, or if a link is
+            delayed only by the real network.
+        stable_ms: Intervals of the delay, equal on all links, in which the control loop is
+            stable. `None` if the linear theory does not cover the scenario.
+        words: Explanation of `stable_ms` for the user, or the reason why the theory does not
+            cover the scenario.
     """
 
     sample_bytes: int
@@ -417,11 +420,11 @@ class NetworkNeeds(NamedTuple):
         """Decides whether a network is good enough for the scenario.
 
         A sample is the state that a site publishes in each tick (a period of its control loop).
-        The receiver uses a sample from the first tick after its arrival, so the age of a sample
-        is an integer number of ticks. The age is computed from the 99th percentile of the
-        network delay, which has no effect if it is shorter than the time for which the scenario
-        itself holds samples. The network is good enough if the loop is stable at that age, and
-        if at most a fraction `MAX_LOST` of the samples is lost.
+        The receiver starts to use a sample at its first tick after the arrival, so the age of
+        the sample in use is an integer number of ticks. The age is computed from the 99th
+        percentile of the network delay, or from the time for which the links of the scenario
+        hold their samples, if that time is longer. The network is good enough if the loop is
+        stable at that age, and if at most a fraction `MAX_LOST` of the samples is lost.
 
         Args:
             row: Measurement at the scenario's own message size and rate.
@@ -488,7 +491,7 @@ def _measure_sample(scenario: Scenario) -> int:
 
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
-    """Result of a benchmark that measures whether the network is good enough for a scenario.
+    """Result of a benchmark that tests whether the network is good enough for a scenario.
 
     There is one verdict per transport (TCP, TLS or QUIC).
 
@@ -497,7 +500,7 @@ class NetworkBenchmark(Result):
         duration_s: Total duration of all measurements, in s.
         needs: Requirements of the scenario.
         rows: Measurements, one row per message size, message rate and transport.
-        judged: For each transport, the verdict on whether it is good enough; see
+        judged: Verdict for each transport on whether the network is good enough; see
             `NetworkNeeds.judge`.
         connect: Endpoints of the far end on another machine. Empty if both ends ran on this
             machine, in which case no network was measured.
@@ -567,7 +570,7 @@ def ping_benchmark(
     connect: Sequence[str] | None = None,
     keys: str | Path | None = None,
 ) -> NetworkBenchmark:
-    """Measures whether a network suits a scenario, as `trilat ping --benchmark` does.
+    """Tests whether a network suits a scenario, as `trilat ping --benchmark` does.
 
     >>> found = tn.ping_benchmark("p_d_margin", duration_s=2)
     >>> [row["transport"] for row in found.to_dict()["transports"]]

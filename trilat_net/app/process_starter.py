@@ -37,7 +37,8 @@ class SessionProcess:
     Created by `ProcessStarter`, which updates it from the reports of the starter process.
 
     Attributes:
-        name: Name of the process: the name of its site, or "recorder".
+        name: Name of the process, for example "m1" for a site, "hand-m1" for an operator
+            program, or "recorder".
         output: File that captures everything the process prints.
         pid: Process ID. `None` before the process has started.
         code: Exit code. `None` before the process has ended.
@@ -69,7 +70,7 @@ class SessionProcess:
         Returns:
             A sentence with the exit code or signal, and the last line that the process printed.
                 `None` if the process has not failed: it is still running, it exited with code
-                0, or this process ended it with a signal.
+                0, or it was interrupted by a signal from `end`.
         """
         exit_code = self.code
         if self._signalled and self.pid is None:
@@ -113,8 +114,9 @@ def create_file(path: Path) -> BinaryIO:
 class ProcessStarter:
     """Starts the child processes of a session, and collects their output in a folder.
 
-    Runs the starter as a child process (`run_starter`) and sends it requests through a pipe.
-    Through the same pipe, the starter reports when a process has started or ended.
+    The processes are forked from a helper process, the starter (`run_starter`). The starter
+    receives requests through a pipe. Through the same pipe, it reports when a process has
+    started or ended.
 
     Args:
         scenario_file: Path of the session's scenario file.
@@ -160,7 +162,8 @@ class ProcessStarter:
     def signal(self, process: SessionProcess, number: int) -> None:
         """Sends a signal to a process of the session, for example to end it.
 
-        A process that has not started yet is then never started.
+        If the starter is not ready to fork processes yet, the signal ends the starter, and the
+        process is never started.
 
         Args:
             process: Process returned by `start`.
@@ -229,7 +232,7 @@ class ProcessStarter:
 class ForkServer:
     """Starts the processes of a session on request, as forks of its own process, the starter.
 
-    A fork is faster than a new Python process, because all modules are imported already.
+    A fork starts faster than a new Python process, because all modules are imported already.
 
     Args:
         pipe: Connection to the requesting process.

@@ -28,8 +28,7 @@ def make_scenario_reader(views_hz: float = 0.0) -> ReadScenario:
             source: Where the scenario comes from, for error messages.
 
         Returns:
-            The facts that the recorder needs, and the function that creates the messages for
-            viewers.
+            The scenario, and the function that creates the messages for viewers.
         """
         scenario = parse_embedded(text, source)
         make_views = find_hook("offer the views of a log")(scenario, views_hz)

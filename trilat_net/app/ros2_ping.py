@@ -139,7 +139,7 @@ class TopicDelays(Result):
         lasts_s: float,
         stopped: Callable[[], bool],
     ) -> "TopicDelays":
-        """Measures the delays of messages on a ROS 2 topic from their sending times.
+        """Measures the delays of messages on a ROS 2 topic, from sending to arrival.
 
         Receives messages for the given duration, then evaluates them for each publishing
         program.

@@ -1,9 +1,9 @@
 """Controls a running session from Python: stops arms, changes links, moves arms, reads records.
 
-A session is a set of processes (sites) that each run one arm and exchange the states of their
-arms over the network. `session` returns a `RunningSession`, whose methods send requests to the
-sites and return their replies. `hand` lets a program act as the operator of an arm. `start`
-starts one of the session's processes, as a user would from a terminal.
+A session is a set of processes (sites) that each control one arm and exchange the states of
+their arms over the network. `session` returns a `RunningSession`, whose methods send requests
+to the sites and return their replies. `hand` lets a program act as the operator of an arm.
+`start` starts one of the session's processes, as a user would from a terminal.
 
 The commands `trilat stop`, `enable`, `reset`, `set`, `ping` and `hand` use the same functions.
 
@@ -69,8 +69,8 @@ def _never_stopped() -> bool:
 class RunningSession:
     """A running session that can be controlled and observed from Python.
 
-    Create one with `session`. Most methods send a request to one or more sites (the processes
-    that each run one arm) and return the replies, one sentence per site.
+    Use `session` to create the object. Most methods send a request to one or more sites (the
+    processes that each control one arm) and return the replies, one sentence per site.
 
     Args:
         name: Name of the session.
@@ -122,7 +122,7 @@ class RunningSession:
         a member that is allowed to send it. Most requests need the operator's keys.
 
         Args:
-            member: Name of the member that sends the requests. Any keys that this object has
+            member: Name of the member that sends the requests. If this object has keys, they
                 must belong to that member. If `member` is empty, the keys of any member are
                 accepted.
             timeout_s: Maximum time to wait for the reply of a site, in s.
@@ -165,7 +165,7 @@ class RunningSession:
             The network connection, and the scenario of the session.
 
         Raises:
-            SessionError: The session has no such site, or the site does not run in time.
+            SessionError: The session has no such site, or the site is not running in time.
         """
         with self.reach(timeout_s=timeout_s) as bus:
             give_up_ns = self._clock.monotonic_ns() + int(timeout_s * 1e9)
@@ -246,8 +246,8 @@ class RunningSession:
             site: Site of the arm.
             scenario: Scenario of the session.
             source: Name of the program or person, used in events of the session.
-            repeats: True to repeat the last message regularly from a thread, which shows the
-                site that the program is still running; see `Hand`.
+            repeats: True to repeat the last message regularly from a thread, so that the site
+                knows that the program is still running; see `Hand`.
 
         Raises:
             UsageError: The scenario does not allow a live operator at that arm.
@@ -302,7 +302,7 @@ class RunningSession:
         return _read_replies(self.send_order(sites, "enable"))
 
     def reset(self, *sites: str) -> list[str]:
-        """Clears faults of arms, such as lost measurements.
+        """Clears the faults of arms, for example a fault due to missing measurements.
 
         The arms can then be enabled again. A fault whose cause persists is not cleared. The
         command `trilat reset` does the same.
@@ -327,7 +327,7 @@ class RunningSession:
             order: The order: "stop", "enable" or "reset".
 
         Returns:
-            The reply of each site, accepted or refused.
+            The reply of each site, which says whether the site accepts or refuses the order.
 
         Raises:
             SessionError: The session has not begun or has no such site, or a site does not
@@ -474,7 +474,7 @@ class RunningSession:
             request: The requested change.
 
         Returns:
-            The reply of the site, accepted or refused.
+            The reply, which says whether the site accepts or refuses the change.
 
         Raises:
             SessionError: The session has no such site or has not begun, or the site does not
@@ -543,9 +543,9 @@ class RunningSession:
     def mark(self, text: str) -> str:
         """Adds a text mark to the log at the current time.
 
-        For example, a user can mark an unusual event in order to find it in the log later. The
-        first site of the scenario that is present publishes the mark as an event, which the
-        recorder stores.
+        For example, a user can mark an unusual event in order to find it in the log later. Of
+        the sites that are present, the first one in the scenario publishes the mark as an
+        event, which the recorder stores.
 
         Args:
             text: Text of the mark, for people who read the log.
@@ -613,7 +613,7 @@ class RunningSession:
                 history.add_change(event.command)
 
             def find() -> dict[str, float]:
-                """Returns the current weight with which the arm follows each peer, by name.
+                """Returns the weight with which the arm follows each peer, keyed by peer name.
 
                 The weights are those at the time of the latest record received from the site.
                 """
@@ -628,10 +628,9 @@ class RunningSession:
             yield find
 
     def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
-        """Measures round-trip times and clock offsets to the processes of the session.
+        """Measures round-trip times to the members of the session, and their clock offsets.
 
-        The command `trilat ping` does the same. The members measured are the sites and the
-        recorders.
+        The members are the sites and the recorders. The command `trilat ping` does the same.
 
         Args:
             count: Number of pings to each member.
@@ -662,8 +661,8 @@ def session(
 ) -> RunningSession:
     """Returns an object that controls and observes a running session.
 
-    Its methods do the same as `trilat stop`, `set` and `ping`. Each call opens a separate
-    connection, unless the object is used in a `with` statement.
+    Its methods do the same as commands such as `trilat stop`, `trilat set` and `trilat ping`.
+    Each call opens a separate connection, unless the object is used in a `with` statement.
 
     >>> with tn.session("paper") as paper:  # doctest: +SKIP
     ...     paper.mark("look here")
@@ -727,7 +726,7 @@ def hand(
 
     Args:
         session: Name of the session. By default, a session has the name of its scenario.
-        site: Site of the arm. The scenario must give it an operator of kind "live".
+        site: Site of the arm. In the scenario, it must have an operator of kind "live".
         connect: Endpoints of the session, as for --connect. If `None`, the session's own
             endpoint on this machine is used.
         router: Endpoints of routers to connect through instead, as for --router.

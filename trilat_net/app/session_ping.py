@@ -43,7 +43,7 @@ ns.
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Measured network delays between the processes of a session, and their clock offsets.
+    """Measured network delays between processes of a session, and offsets of their clocks.
 
     Attributes:
         session: Name of the session.
@@ -78,10 +78,9 @@ class PingReport(Result):
 class SessionPing:
     """A single measurement of a session's round-trip times and link delays.
 
-    Call `poll` repeatedly until `is_over` returns True, then call `report`. The measurement is
-    not part of any control loop. It discovers the members by sending a query, measures
-    round-trip times with pings, and reads the link delays from the statistics that the sites
-    publish.
+    Call `poll` repeatedly until `is_over` returns True, then call `report`. The object finds
+    the members by sending a query, measures round-trip times with pings, and reads the link
+    delays from the statistics that the sites publish. It takes no part in the control loops.
 
     Args:
         bus: Network connection that reaches the session.
@@ -115,7 +114,7 @@ class SessionPing:
     def poll(self) -> None:
         """Processes the messages that have arrived, and sends pings and queries that are due.
 
-        The caller calls this method repeatedly until enough time has passed. It never blocks.
+        Call this method repeatedly until `is_over` returns True. It never blocks.
         """
         for info in self._members.poll():
             self.infos[info.member] = info
@@ -235,7 +234,7 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures round-trip times and delays in the network of a running session once.
+    """Measures the round-trip times and link delays of a running session.
 
     Args:
         connection: Endpoints of the session, and keys.

@@ -19,7 +19,7 @@ It applies to sessions that sites may leave, in which some sites may never reply
 
 
 class SessionSearch:
-    """Search for the sites of a session, the processes that each run one arm.
+    """Finds the sites of a session, which are the processes that each control one arm.
 
     Args:
         bus: Network connection that reaches the session.
@@ -40,7 +40,7 @@ class SessionSearch:
         the search also ends `GATHERING_NS` after the first reply.
 
         Returns:
-            The scenario of the session, and the replies by the name of the site.
+            The scenario of the session, and the replies, keyed by site name.
 
         Raises:
             SessionError: No site replies.
@@ -74,7 +74,7 @@ class SessionSearch:
         return scenario, infos
 
     def find_running(self, site: str) -> Info:
-        """Waits for the reply of one site, and checks that the site runs.
+        """Waits for the reply of one site, and checks that the site is running.
 
         All members of the session are asked. The reply of any site contains the scenario, which
         shows whether the name of the wanted site is misspelled.

@@ -40,10 +40,10 @@ class VisibleStates:
         self._picture_delay: PictureDelay | None = None  # created when the first record arrives
 
     def read(self) -> dict[str, State]:
-        """Returns the latest known record of each site, keyed by site name.
+        """Returns the latest visible record of each site, keyed by site name.
 
-        The dictionary is empty until the first record has arrived. The records that the user of
-        a site sees may be older than the latest ones.
+        The user of a site may see older records than the latest ones. The dictionary is empty
+        until the first record has arrived.
         """
         as_site = self._as_site
         for record in self._read_records():

@@ -48,7 +48,10 @@ WINDOWS = 16
 
 
 class Push(NamedTuple):
-    """Small displacement of the state of a twin, for example by 1e-6 rad at one joint.
+    """Small displacement of the state of a run, for example by 1e-6 rad at one joint.
+
+    The run is executed a second time with this displacement. This second execution is called a
+    twin.
 
     Attributes:
         name: Description for the user, for example "1e-06 rad at m1 joint 1".
@@ -56,10 +59,10 @@ class Push(NamedTuple):
             rad/s, or estimated arm parameters "theta_hat".
         by: Displacement of every element of this part, shape (N, n), with one row per site.
         at_s: Time of the push, in s after the epoch (the common start time).
-        again: If True, a twin whose difference has decayed to rounding errors is pushed again.
-            Otherwise the twin ends.
-        largest: Difference beyond which the twin is moved closer to the run, in the unit of the
-            field. Infinite to disable this.
+        again: If True, the twin is pushed again when its difference from the run has decayed to
+            rounding errors. Otherwise the twin ends then.
+        largest: Difference from the run, in rad or rad/s, above which the difference is scaled
+            down to the size of the push; see `LARGEST`. Infinite if it is never scaled down.
         direction: Number of the random direction, from 1, if all joints are pushed together
             because there are too few pushes for one per joint. Otherwise 0.
     """
@@ -83,8 +86,8 @@ class Push(NamedTuple):
         the site are pushed in a random direction. Without a site, the joints or estimates of
         all sites are pushed.
 
-        The twin is pushed only once. A push that is itself larger than `LARGEST` is never
-        scaled down.
+        The twin is pushed only once. If the size of the push is at least `LARGEST`, the
+        resulting difference is never scaled down.
 
         Args:
             scenario: The scenario.
@@ -135,7 +138,7 @@ class Push(NamedTuple):
     def choose(cls, scenario: Scenario, count: int | None = None) -> "list[Push]":
         """Chooses pushes that together can reveal every kind of instability.
 
-        Different pushes displace different joints or estimates:
+        The pushes are:
 
         - one push of all estimated parameters, if the control law of any site estimates
           parameters;
@@ -144,13 +147,13 @@ class Push(NamedTuple):
         - one push per joint, because growth at a joint that does not act on the others is
           clearly visible only if that joint itself is pushed.
 
-        If there are not enough pushes for all joints, the joints are not pushed one by one, but
-        all together in several random directions.
+        If `count` is too small for one push per joint, all joints are pushed together instead,
+        in several random directions.
 
         Args:
             scenario: The scenario.
-            count: Number of pushes. If None, each joint is pushed in addition to the other
-                pushes above, up to `MAX_PUSHES` in total.
+            count: Largest number of pushes. If None, two more than there are joints, but at
+                most `MAX_PUSHES`.
         """
         # The target of "m1 joint 1" is "m1.q1".
         joint_targets = [joint.replace(" joint ", ".q") for joint in _list_joints(scenario)]
@@ -176,10 +179,10 @@ class Push(NamedTuple):
 
 
 class TwinPath(NamedTuple):
-    """Distance between a twin and the run over time, in intervals of 50 ms.
+    """Difference over time between a run and a slightly displaced copy of it (a twin).
 
-    A large difference is scaled down, and a twin whose difference has decayed is pushed again.
-    The run has K intervals, and all sites together have J joints.
+    A large difference is scaled down. When the difference has decayed, the twin is pushed again
+    (see `Push`). The run has K intervals of 50 ms, and all sites together have J joints.
 
     Attributes:
         push: Push of the twin.
@@ -192,8 +195,8 @@ class TwinPath(NamedTuple):
         scale: Natural logarithm of the factor by which `last` must be multiplied to undo the
             scaling, shape (K,).
         pushed: Indices of the intervals in which the twin was pushed.
-        died: Index of the interval from which the difference consists only of rounding errors.
-            None if there is no such interval, or if the twin was pushed again.
+        died: Index of the interval from which onwards the difference consists only of rounding
+            errors. None if there is no such interval, or if the twin was pushed again.
     """
 
     push: Push
@@ -227,7 +230,7 @@ class Twins(NamedTuple):
 
     @classmethod
     def of_log(cls, log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> "Twins":
-        """Repeats the run of a log, together with one twin per push.
+        """Repeats the run of a log, once unchanged and once with each of the pushes.
 
         Args:
             log: Log of the run.
@@ -236,7 +239,7 @@ class Twins(NamedTuple):
 
         Raises:
             NotRepeatable: The run cannot be repeated, or the repeated run differs from the
-                records.
+                records by more than rounding errors.
             LogError: A record cannot be read.
         """
         reason = FusedRun.explain_not_repeatable(log, own_laws=own_laws)
@@ -804,7 +807,8 @@ class _LaneTwinRuns(_TwinRuns):
 def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
     """Returns the times at which differences between runs are measured, in s, ascending.
 
-    They are the multiples of 50 ms, and the times at which copies of the run are displaced.
+    They are the ends of `WINDOWS` windows of equal length, rounded up to multiples of 50 ms,
+    and the times at which copies of the run are displaced.
 
     Args:
         end_s: Duration of the run, in s.

@@ -49,8 +49,8 @@ _COLUMNS = 5
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
     """Computes the playback order of recorded messages, and the deadline of each, in ns.
 
-    Messages are played in order of time. Within a channel they are also played in order of
-    their numbers, even if a message was recorded late.
+    Messages are played in order of time, with one exception: a message whose time is later than
+    that of a message with a higher number in the same channel is played before that message.
 
     Args:
         times_ns: Sending or arrival time of each of K messages in file order, shape (K,), in
@@ -113,7 +113,7 @@ class MessageBatch:
 
     @property
     def times_ns(self) -> Ints:
-        """Time of each message, in ns after the start of the session, shape (K,).
+        """Deadline of each message, in ns after the start of the session, shape (K,).
 
         The player publishes each message at this time, scaled by the playback speed.
         """
@@ -121,7 +121,7 @@ class MessageBatch:
 
     @property
     def end_ns(self) -> int:
-        """Time of the last message of the batch, in ns after the start of the session.
+        """Deadline of the last message of the batch, in ns after the start of the session.
 
         Raises IndexError if the batch is empty.
         """
@@ -175,7 +175,7 @@ class MessageBatch:
             indices: Messages to select, in the desired order.
 
         Returns:
-            A batch that shares the buffer of this one.
+            A batch that shares the buffer of this batch.
         """
         return MessageBatch(self.rows[indices], self.data)
 
@@ -203,8 +203,8 @@ class MessageBatch:
     def compact(self) -> "MessageBatch":
         """Copies the messages into a batch whose buffer contains only their payloads.
 
-        A batch may be a small part of a large buffer, and keeps the whole buffer in memory.
-        Making a copy allows the large buffer to be freed.
+        A batch may use only a small part of a large buffer, but keeps the whole buffer in
+        memory. Making a copy allows the large buffer to be freed.
         """
         buffer = memoryview(self.data)
         payload_spans = self.rows[:, _START:].tolist()
@@ -223,8 +223,7 @@ class BatchBuilder:
 
     Args:
         kept: Messages that were sorted in an earlier step but have not been played yet. They
-            are treated as the first messages that were added. `None` if there are no such
-            messages.
+            are treated as if they had been added first. `None` if there are no such messages.
     """
 
     def __init__(self, kept: MessageBatch | None = None) -> None:
@@ -267,8 +266,8 @@ class BatchBuilder:
         A message that is contained in two files of a session is included only once.
 
         Returns:
-            The sorted messages. The time of each is its deadline, which ensures that no message
-            is played after the next message of its channel.
+            The sorted messages, each with its deadline. The deadline of a message is never
+            later than that of the next message in the same channel.
         """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)

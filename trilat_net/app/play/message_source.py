@@ -55,7 +55,7 @@ class _RoundEnd(NamedTuple):
 
     Attributes:
         strays: Number of messages that appear too late in the file to be played in order.
-        torn: The damaged files, with the reason.
+        torn: The damaged files, each with a description of the damage.
     """
 
     strays: int
@@ -140,9 +140,9 @@ class MessageSource:
         """Returns the next messages to play, if any are available, without waiting.
 
         Each call takes one item from the queue `_ahead`. The item is a piece of the log, the
-        end of the round, or the error of the process that reads the log. The end of the round
-        also reports the strays (messages that are played out of order) and the damaged files.
-        `restart` begins the next round.
+        end of the round, or an error of the process that reads the log. The item for the end of
+        the round also contains the number of strays (messages that are played out of order) and
+        the damaged files. `restart` begins the next round.
 
         Returns:
             The messages. `None` if no messages are available now, or if the round has ended
@@ -172,8 +172,8 @@ class MessageSource:
     def fill(self) -> bool:
         """Prefetches messages from the process that reads the log, without waiting.
 
-        The player calls this method when there is time before the next message. It reads bytes
-        from the pipe and decodes them, so that `poll` can return the messages.
+        The player calls this method when there is time before the next message. The method
+        reads bytes from the pipe and decodes them, so that `poll` can return the messages.
 
         Returns:
             True if bytes were read. False if no bytes are available now, or if enough messages
@@ -244,10 +244,9 @@ def sort_messages(
     A message may appear late in the file, because a site sent it again after a loss. Messages
     are therefore buffered for a while before they are yielded, within a memory limit.
 
-    A buffered message is yielded once a message arrives that is later by at least the horizon.
-    Messages are yielded at most once per step of log time, so that larger parts are sorted at
-    once. The first part is yielded when the horizon and one step have been read, and another
-    part after each further step.
+    The messages are sorted and yielded in large parts. The first part is yielded when the
+    horizon and one step of log time have been read, and another part after each further step. A
+    part contains the messages that are older than the newest message by at least the horizon.
 
     Args:
         messages: The messages, in file order.
@@ -351,9 +350,9 @@ def feed_player(
     """Sends the messages of a log to the player until all are sent or the player has ended.
 
     This is the main function of the reader process. It reads a log that does not fit in memory,
-    while the player (another process) publishes its messages. Each pass through the log is
-    followed by a report of the damaged files and of the strays, which are messages that appear
-    too late in the file to be put in order.
+    while the player (another process) publishes its messages. After each pass through the log,
+    it reports the damaged files and the number of strays, which are messages that appear too
+    late in the file to be put in order.
 
     Args:
         pipe: Pipe to the player.
@@ -365,9 +364,9 @@ def feed_player(
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
     def send(item: _ReadPiece | _RoundEnd | LogError) -> None:
-        """Writes an item to the pipe, and waits until the player has made room.
+        """Writes an item to the pipe, and waits while the pipe is full.
 
-        Waiting limits how far the reader runs ahead, and therefore its memory. Each item is
+        Waiting limits how far the reader runs ahead, and therefore its memory use. Each item is
         preceded by its size, which tells the player where the item ends.
         """
         pickled = pickle.dumps(item)

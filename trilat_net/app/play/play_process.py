@@ -81,7 +81,7 @@ class PlaybackSummary(NamedTuple):
         recorders: Number of recorders that were present after the last message.
         stored: True if all these recorders reported that they stored everything.
         refilled: Number of messages that were sent again to recorders that missed them.
-        torn: The damaged files, with the reason.
+        torn: The damaged files, each with a description of the damage.
     """
 
     counts: dict[str, int]
@@ -101,8 +101,8 @@ class PlaybackSummary(NamedTuple):
 class Playback:
     """One playback of a log, which looks like a running session to other programs.
 
-    The session has its own name. This object replies to other programs on behalf of the
-    original arms, while its `Player` publishes the messages.
+    The session has the name `options.session`. This object replies to other programs on behalf
+    of the original sites, while its `Player` publishes the messages.
 
     Attributes:
         bus: Network connection of the player.
@@ -158,7 +158,7 @@ class Playback:
             self.show(progress)
 
     def play(self, start_ns: int | None) -> PlaybackSummary:
-        """Plays the log to its end, and stays until all recorders have every message.
+        """Plays the log to its end, and waits until the recorders need no more messages.
 
         Returns earlier if `stopped` returns True.
 
@@ -282,7 +282,7 @@ def play_log(
         The summary. `None` if the playback was stopped before it began.
 
     Raises:
-        SessionError: A session of that name is already running.
+        SessionError: A session with the name `options.session` is already running.
         UsageError: An endpoint cannot be used.
         LogError: A file can no longer be read.
     """

@@ -47,7 +47,7 @@ class PlaySelection:
             no limit.
         stop_ns: Latest time of a message, in ns after the start of the session. `None` for no
             limit.
-        time: Whether the sending time or the arrival time of a message is used.
+        time: "publish" to use the sending time of each message, "log" to use its arrival time.
     """
 
     channels: ChannelFilter = field(default_factory=ChannelFilter)
@@ -148,7 +148,7 @@ class PlaySelection:
 
 
 HORIZON_NS = 70 * NS_PER_S
-"""Largest distance between a message's position in a file and its turn, in ns. Sites keep their
+"""Largest time by which a message may appear too late in a file, in ns. Sites keep their
 messages for a minute, and send them again to recorders that missed them.
 """
 _LAST = 1 << 61
@@ -165,8 +165,9 @@ class PayloadHeader(msgspec.Struct):
     They exist in all versions of the message format, so that old logs can be replayed.
 
     Attributes:
-        boot: Number that identifies the start of the sender. It is -1 if it cannot be decoded.
-        n: Number of an event. It is -1 if there is no number.
+        boot: Random number that the sender drew when it started. It is -1 if it cannot be
+            decoded.
+        n: Number of the message, if it is an event that has a number. Otherwise -1.
     """
 
     boot: int = -1
@@ -197,7 +198,7 @@ class SessionHeader:
         boots: For each site, the random number that identifies its first start.
         topics: Topics of the channels that are played. The index of a topic is its channel
             index.
-        torn: The damaged files, with the reason.
+        torn: The damaged files, each with a description of the damage.
         first_ns: Time of the earliest message so far, in ns after the start of the session.
         last_ns: Time of the latest message so far, in ns after the start of the session.
     """
@@ -231,9 +232,9 @@ class SessionHeader:
 
 
 class _PlayedChannel:
-    """A channel (topic) of a log file, which numbers its messages in the order of sending.
+    """A channel (topic) of a log file, with a method that numbers its messages for playback.
 
-    Messages are replayed in this order.
+    The messages are played in the order in which they were sent.
 
     Args:
         topic: Topic of the channel.
@@ -275,7 +276,7 @@ class _PlayedChannel:
         """Returns the number that determines the position of a message within its channel.
 
         The messages of a channel are played in order of these numbers. To reproduce the order
-        of the original publication, three kinds of numbers are used:
+        in which the messages were originally published, three kinds of numbers are used:
 
         - Records and statistics of a site are numbered by their control period (tick). A site
           that was started again continues these numbers.

@@ -73,7 +73,7 @@ class _ChannelMessages(NamedTuple):
 class PlayedHistory:
     """Stores played messages, so that recorders that missed some can request them again.
 
-    Recorders request lost messages of a real session in the same way.
+    In a real session, recorders request lost messages in the same way.
 
     Args:
         kept_ns: How long a message is stored after it is played, in ns of log time. If `None`,
@@ -175,8 +175,8 @@ _MAX_RECORDER_EVENTS = 256
 class SiteStandIns:
     """Replies on behalf of the sites of a recorded session while its log is played.
 
-    This makes the playback look like a running session: its arms announce themselves, reply to
-    queries, and resend messages that a recorder missed.
+    This makes the playback look like a running session, whose sites announce themselves, reply
+    to queries, and resend messages that a recorder missed.
 
     Args:
         bus: Network connection of the player.
@@ -290,11 +290,10 @@ class SiteStandIns:
     def have_stored(self, recorders: Collection[str]) -> bool:
         """Returns True if the recorders have reported that they stored every site's messages.
 
-        The player may then leave, because no recorder will request a message again.
+        The player may then end, because no recorder will request a message again.
 
         Args:
-            recorders: Identifiers of the recorders: the random numbers of their starts, as
-                strings.
+            recorders: Identifiers of the recorders, in the form of the attribute `recorders`.
         """
         all_sites = self._sites.keys()
         for recorder in recorders:

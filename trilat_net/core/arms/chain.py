@@ -69,7 +69,8 @@ Spatial = tuple[Three, Three]
 class ChainJoint(NamedTuple):
     """Geometry, drive, friction and end stops of one joint.
 
-    The mass and inertia of the link that the joint moves are not stored here but in theta.
+    The mass and inertia of the link that the joint moves are not stored here, but in the
+    parameter vector theta of the chain.
 
     Attributes:
         prismatic: True for a sliding joint (m, N), False for a revolute joint (rad, N m).
@@ -164,8 +165,8 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
 
     Args:
         joints: The joints, starting at the base.
-        width: Number of joints for which each row has space. Defaults to the length of the
-            chain.
+        width: Number of elements of the field `M`, which holds a row of the inertia matrix.
+            Defaults to the number of joints.
 
     Returns:
         Array with one row per joint, shape (n,). See `chain_dtype`.
@@ -689,7 +690,7 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 
 @leaf
 def parameter_gradient(chain: RowArray, gradient: Array) -> None:
-    """Computes Y' r, which drives the parameter estimate of the adaptive control law.
+    """Computes Y' r, with which the adaptive control law updates its parameter estimate.
 
     Y is the regressor: Y theta is the torque of the links in `inverse_dynamics`, where theta is
     the vector of their inertial parameters. The filtered error r = qd - v is the difference

@@ -151,7 +151,7 @@ class ChainDynamics:
 
     Args:
         chain: Joints, gravity and end effector.
-        theta: Parameters of the links, shape (10 n,). See `chain`.
+        theta: Parameters of the links, shape (10 n,). See the module `chain`.
     """
 
     def __init__(self, chain: ChainSetup, theta: Array) -> None:

@@ -39,8 +39,8 @@ def place_chain(s: Row, chain: RowArray) -> None:
     module use the poses.
 
     Args:
-        s: State of the site. In task space (arms follow each other's end effectors instead of
-            joint angles), the end effector pose is written into it.
+        s: State of the site. In task space (where arms follow each other's end effectors
+            instead of joint angles), the end effector pose is written into it.
         chain: Joint data, one row per joint; the frames are updated.
     """
     place_joints(chain, s.q)
@@ -54,8 +54,8 @@ def update_errors(s: Row, chain: RowArray) -> None:
 
     The results are the position error e, the velocity error ed, the filtered error r, and the
     reference velocity v and acceleration a. For the adaptive law, the product Y' r (Y is the
-    regressor of the arm's dynamics) is also computed; it drives the estimate of the dynamic
-    parameters.
+    regressor of the arm's dynamics) is also computed. The law uses this product to update its
+    estimate of the dynamic parameters.
 
     Args:
         s: State of the site; the results are written into it.
@@ -395,7 +395,7 @@ def use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
             replaced by the state of the next stage. The sums `sum_qd` and `sum_qdd` are
             updated.
         joints: Number of joints.
-        weight: Weight of this stage in the sums: 1 or 2, in sixths.
+        weight: Weight of this stage in the sums, 1 or 2.
         ahead_s: Time from the beginning of the period to the next stage, s.
     """
     for i in range(joints):

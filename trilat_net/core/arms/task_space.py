@@ -446,7 +446,7 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
 
 @leaf
 def update_wrench(s: Row) -> None:
-    """Computes the force and torque at the end effector that correspond to tau_x.
+    """Computes the force and torque at the end effector for the external joint torque tau_x.
 
     This wrench is the solution of
 

@@ -57,8 +57,8 @@ class ArmLinks(NamedTuple):
     def theta(self) -> Array:
         """Returns the dynamic parameters theta of the arm, shape (5,), Eq. (24).
 
-        The torque of the arm is linear in theta. The first three entries are inertial, in kg
-        m^2; the last two belong to gravity, in kg m.
+        The torque of the arm is linear in theta. The first three entries are inertial
+        parameters, in kg m^2; the last two are gravity parameters, in kg m.
         """
         l1, m1, lc1, I1, _, m2, lc2, I2 = self
         inner_inertia = m1 * lc1**2
@@ -73,7 +73,9 @@ class ArmLinks(NamedTuple):
 
 @leaf
 def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
-    """Returns the inertia matrix M(q) of the planar arm as two rows, kg m^2 (Section IV).
+    """Returns the inertia matrix M(q) of the planar arm as two rows, kg m^2.
+
+    The matrix is given in Section IV of the paper:
 
         M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
             | theta_3 + theta_2 cos(q2)      theta_3                   |
@@ -118,7 +120,7 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
         Y theta = M(q) a + C(q, qd) v + G(q)
 
     The vector theta has three inertial and two gravity parameters (see `ArmLinks.theta`). With
-    qi the angle of joint i, the equation of motion in these parameters is
+    qi the angle of joint i, the terms of the equation of motion in these parameters are
 
         M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
             | theta_3 + theta_2 cos(q2)      theta_3                   |

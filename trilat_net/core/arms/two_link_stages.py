@@ -27,8 +27,9 @@ def update_errors(s: Row) -> None:
     """Computes the tracking errors of the planar arm and the regressor of its dynamics.
 
     The results are the position error e, the velocity error ed, the filtered error r, the
-    regressor Y and the product Y' r. Y times the dynamic parameters of the arm is a torque, and
-    Y' r drives the estimate of these parameters.
+    regressor Y and the product Y' r. Y times the dynamic parameters of the arm is the torque
+    required for the reference motion. The adaptive law uses Y' r to update its estimate of
+    these parameters.
 
     Args:
         s: State of the site, with q, qd and the reference; the results are written into it.

@@ -78,8 +78,8 @@ class LinkStates(NamedTuple):
         links: States of the links, shape (L, N, P), see `LinkRow`.
         models: Delay and loss models, shape (L, N, P, M).
         points: Traces and outages of each run, shape (L, n, 2).
-        releases: For each tick, the newest sample that is released then, or -1. A ring buffer
-            of shape (L, N, P, R), where R is a power of two.
+        releases: For each tick, the newest sample that is released in this tick, or -1. A ring
+            buffer of shape (L, N, P, R), where R is a power of two.
         newest: Sample in use at the last tick, or -1, shape (L, N, P).
         uniforms: Buffer for two random numbers per sample of a block.
         delays_us: Buffer for the delay of each sample of a block, us.
@@ -508,15 +508,15 @@ def use_samples(
         first: First tick of the block.
         count: Number of ticks.
         rate_hz: Tick rate of all sites, Hz.
-        ended: For each lane, the number of ticks executed if the run has ended, otherwise -1.
+        ended: For each run, the number of ticks executed if the run has ended, otherwise -1.
         states: State of the links of the runs; updated in place.
         draws: Functions that draw random numbers.
         used: Output array for the index of the sample in use, or -1 before the first sample,
             shape (N, P, LANES, ticks).
 
     Returns:
-        The largest age of a sample in use, in ticks. Before the first sample, this is the age
-        that the first sample would have.
+        The largest age of a sample in use, in ticks. Before the first sample, the age is
+        counted as if sample -1 were in use.
     """
     largest_age = 0
     has_whole_period = 1_000_000_000 % rate_hz == 0
@@ -602,7 +602,7 @@ def use_samples_of_rates(
 
     Args:
         first: First tick of each site in the block, shape (N,).
-        end: Tick of each site after the block, shape (N,).
+        end: First tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
         next_samples: Next sample that each site accepts from each peer, shape (N, P); updated
             in place.
@@ -741,14 +741,15 @@ def use_recorded_samples(
 
     Args:
         first: First tick of each site in the block, shape (N,).
-        end: Tick of each site after the block, shape (N,).
+        end: First tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
         feed: Inputs of the recorded run.
         links: Rows of the links, shape (N, P); updated in place.
         models: Models of the links, shape (N, P, M).
         dues: Due times, shape (N, P, D); updated in place.
-        calendars: Calendars of the links, shape (N, P, pages); updated in place. Their samples
-            have the right index, but no content.
+        calendars: Calendars of the links (buffers of delayed samples), shape (N, P, pages);
+            updated in place. The samples written into them have the right index, but arbitrary
+            content.
         points: Traces and outages.
         channel: Values that laws receive, or None; updated in place.
         state: An array of arbitrary content, at least as long as the state that a site sends.
@@ -810,7 +811,7 @@ def repeat_deliveries(
 
     Args:
         first: First tick of each site, shape (N,).
-        end: Tick of each site before which its links stop, shape (N,).
+        end: For each site, the tick after the last tick to execute, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
         next_samples: Next sample that each site accepts from each peer, shape (N, P); updated
             in place.

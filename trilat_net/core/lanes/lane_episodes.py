@@ -222,19 +222,19 @@ class LaneEpisodes(LaneRun):
     `load` puts a new run into its lane while the other lanes continue.
 
     Args:
-        run: Any run of this structure before its first tick, see `explain_run`.
+        run: Any run before its first tick, see `explain_run`. All runs must have the same
+            structure.
         count: Number of lanes that hold a run, at most `LANES`.
         hand_site: Index of the site whose arm is moved by a program.
-        hand_row: Index of its live operator among the operators of the site.
+        hand_row: Index of the live operator of that site among the operators of the site.
         period_ticks: Time between decisions of the program, ticks.
 
     Attributes:
         ticks: Number of ticks that each run has executed, shape (LANES,).
-        hands: The program's hand in each lane.
+        hands: State of the program's hold on the arm, in each lane.
         structure: The common structure of the runs, see `RunStructure`.
         most_runs: Largest number of runs that can be simulated together.
-        least_runs: Smallest number of runs for which lanes are faster than simulating the runs
-            one by one.
+        least_runs: Smallest number of runs that are simulated faster in lanes than one by one.
     """
 
     clock = _CLOCK
@@ -279,13 +279,13 @@ class LaneEpisodes(LaneRun):
 
     @staticmethod
     def explain_hand(rules: HandRules, period_ticks: int, largest_action: float) -> str:
-        """Explains why the actions of a program that moves an arm require a slower simulation.
+        """Explains why a program's actions prevent several episodes from being run together.
 
-        Simulating several episodes side by side is faster, but supports only some actions.
-        Returns an empty string if the actions are supported.
+        The program moves an arm. Simulating several episodes side by side is faster, but only
+        possible for some kinds of actions. Returns an empty string if it is possible.
 
         Args:
-            rules: Limits of the program's hand.
+            rules: Limits on the program's actions.
             period_ticks: Number of ticks per step.
             largest_action: Largest absolute value of any component of an action.
         """
@@ -317,7 +317,7 @@ class LaneEpisodes(LaneRun):
         Args:
             lane: Index of the lane.
             run: The run before its first tick, with the same structure as the others.
-            rules: Limits of the program's hand, see `HandRules`.
+            rules: Limits on the program's actions, see `HandRules`.
         """
         memory = run.memory
         tables = memory.tables
@@ -403,8 +403,8 @@ class LaneEpisodes(LaneRun):
 
         Args:
             count: Number of ticks, at most `BLOCK_TICKS`.
-            is_idle: True for runs that are not advanced, shape (runs,). Their state is
-                meaningless afterwards, unless they have ended.
+            is_idle: True for runs that are not advanced, shape (runs,). The state of such a run
+                is meaningless afterwards, unless the run has ended.
             acts: True for runs in which a decision of the program takes effect at the first
                 tick, shape (runs,).
             goals: The decisions that take effect, shape (runs, 2).
@@ -502,9 +502,9 @@ class LaneEpisodes(LaneRun):
 
     @property
     def has_ended(self) -> NDArray[np.bool_]:
-        """Returns which of the runs ended early because an arm left its safety limits.
+        """True for each run that has ended because an arm left its safety limits.
 
-        The array has shape (runs,), and is True for each run that ended.
+        The array has shape (runs,).
         """
         return self._ended.ticks[: len(self.runs)] >= 0
 
@@ -562,9 +562,9 @@ class LaneEpisodes(LaneRun):
         return in_order.view(dtype.base)
 
     def read_new(self, i: int) -> NDArray[np.bool_]:
-        """For each peer, returns True if site `i` used a new sample in its latest tick.
+        """Returns True for each peer from which site `i` used a new sample in its latest tick.
 
-        The shape is (P, runs) for P peers.
+        The array has shape (P, runs), for P peers.
         """
         runs = len(self.runs)
         lanes = np.arange(runs)

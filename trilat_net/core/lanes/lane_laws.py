@@ -45,7 +45,8 @@ class LaneLaw(NamedTuple):
     Runs share the code if these properties are equal.
 
     Attributes:
-        name: Identifies the code of the law. `NO_LAW` for laws of the kernel.
+        name: Identifies the code of the law. `NO_LAW` if the law is part of the module
+            `kernel`.
         is_stored: True if the compiled code may be stored on disk.
         size: Number of gains and memory values of the law.
         constants: Names and values of the flags among the gains and memory values. Flags are

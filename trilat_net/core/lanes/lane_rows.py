@@ -110,10 +110,10 @@ class LaneTable(types.Type):
 
     @property
     def count(self) -> int:
-        """Number of records that have their own constant fields, known to the compiler.
+        """Number of records of one run, each of which has its own constant fields.
 
         A field is constant if it is the same in all simulated runs (lanes), for example the
-        type of a network link.
+        type of a network link. The compiler knows the constant fields.
         """
         return len(self.constants)
 
@@ -129,7 +129,7 @@ class _PartOfTable(LaneTable):
 
 
 class RowType(types.Type):
-    """Base class of the Numba types of a record in lanes, which look up fields by name.
+    """Base class of the Numba types of a record in lanes, whose fields are found by name.
 
     Attributes:
         fields: Fields of the record.
@@ -217,13 +217,13 @@ def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
 def offset_rows(builder: Any, pointer: Any, word_count: int) -> Any:
     """Generates LLVM code for the address a given number of words after a pointer.
 
-    The rows of several runs are stored side by side, so each value of a row occupies `LANES`
-    values in memory.
+    The rows of several runs are stored side by side, so each word of a row takes up the space
+    of `LANES` words in memory.
 
     Args:
         builder: Builder that appends LLVM instructions.
         pointer: The pointer.
-        word_count: Distance in 64-bit words of a row of a single run.
+        word_count: Distance from the pointer in a row of a single run, in 64-bit words.
     """
     word = ir.IntType(64)
     return _offset_pointer(builder, pointer, ir.Constant(word, word_count * LANES * _WORD))

@@ -290,7 +290,8 @@ class _LinksOfRun:
             links: Rows of the run's links after these ticks. Only the fields of the sample in
                 use, and those written in stage 3 of a tick, are up to date.
             states: The latest states of the run's sites, see `repeat_deliveries`.
-            received: Values from laws that arrived with the samples in use, shape (N P, C).
+            received: Values sent by control laws, which arrived with the samples in use, shape
+                (N P, C).
         """
         self._ends.append(ticks.copy())
         self._run.pending_deliveries = partial(self._update, links, states, received)
@@ -349,7 +350,8 @@ class LaneRun:
 
     Args:
         runs: The runs before their first tick, at most `LANES`. They must have the same
-            structure, see `RunStructure`, and no obstacle, see `RunStructure.find_obstacle`.
+            structure, see `RunStructure`, and nothing may prevent them from being simulated
+            together, see `RunStructure.find_obstacle`.
         record_rows: Number of latest records kept per site, a power of two.
 
     Attributes:
@@ -364,8 +366,7 @@ class LaneRun:
         """Returns the code with which a run is simulated in a lane, one object per site.
 
         Args:
-            run: The run. `RunStructure.find_obstacle` must have found no obstacle to computing
-                it in a lane.
+            run: The run, for which `RunStructure.find_obstacle` must return an empty string.
         """
         structure = RunStructure.find(run)
         layout = _find_layout(run)

@@ -168,7 +168,9 @@ def use_states(
     used: IntArray,
     columns: IntArray,
 ) -> None:
-    """Copies the peers' states in use to the links of an arm (stage 2 of a tick, release).
+    """Copies the peers' states that an arm uses in a tick to the links of the arm.
+
+    This is stage 2 of the tick (release).
 
     Args:
         t_ns: Nominal time of the tick, ns since the epoch, see `number_of`.
@@ -181,7 +183,7 @@ def use_states(
         links: Rows of its links; updated in place.
         received: Rows with the values sent by the peers' laws; updated in place.
         states: The latest states of all sites, see `advance_site`.
-        used: Sample in use by peer, lane and tick of a block; -1 before the first.
+        used: Sample in use, for each peer, lane and tick of a block; -1 before the first.
         columns: Indices of the received values, see `LaneLaw`, shape (P, C).
     """
     for lane in range(lanes):
@@ -312,7 +314,7 @@ def advance_site(
         states: The latest states of all sites (q, qd, tau_x and the values sent by the law),
             shape (N, pages + 1, LANES, width). The last page holds the state before the first
             tick.
-        used: Sample in use by peer, lane and tick of a block; -1 before the first.
+        used: Sample in use, for each peer, lane and tick of a block; -1 before the first.
         columns: Indices of the received values, see `LaneLaw`, shape (P, C).
         table: Tables of the operators and environments of all sites, the same in all runs.
     """
@@ -533,7 +535,8 @@ class EndedRuns(NamedTuple):
         progress: Rows of the progress, shape (N, words per row, LANES).
         laws: Gains and memory of compiled laws, shape (N, values, LANES).
         sent: Values sent by these laws, shape (N, values, LANES).
-        peaks: Peaks in the bucket of the last tick, shape (N, 3 n, LANES).
+        peaks: Largest values in the 50 ms interval (bucket) of the last tick, shape
+            (N, 3 n, LANES).
     """
 
     ticks: IntArray
@@ -550,7 +553,7 @@ class EndedRuns(NamedTuple):
 
 @leaf
 def copy_lane(lane: int, source: Words, target: Words) -> None:
-    """Copies the state of one simulation from one array of several simulations to another.
+    """Copies the state of one run between two arrays that hold the states of several runs.
 
     Args:
         lane: Lane index of the run.
@@ -683,7 +686,7 @@ def call_site(
     Args:
         address: Address of the code of `advance_site` or `advance_chain_site`.
         k: The tick of all lanes, or a pointer to the tick of each lane.
-        t_ns: Nominal time of the tick, ns since the epoch, in the same form.
+        t_ns: Nominal time of the tick, ns since the epoch, in the same form as `k`.
         lanes: Number of lanes to compute.
         settled_rad: Position error below which an arm counts as settled, rad.
         i: Index of the site.
@@ -762,7 +765,7 @@ def run_block(
     Args:
         first: First tick of each site in the block, shape (N,).
         ticks: Number of ticks executed by each site, shape (N,); updated in place.
-        end: Tick of each site after the block, shape (N,).
+        end: First tick of each site after the block, shape (N,).
         rates_hz: Tick rates, Hz, shape (N,).
         next_ns: Buffer for the time of the next tick of each site, ns, shape (N,).
         latest: Buffer for information about the latest tick, see `keep_ended_runs`.

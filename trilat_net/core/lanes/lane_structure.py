@@ -2,7 +2,7 @@
 
 Vector instructions evaluate the same equations for several runs. Runs can therefore be computed
 together if they differ only in numerical values, such as gains or start poses. Properties that
-select the equations, for example the type of control law, form the structure of a run.
+determine the equations, for example the type of control law, form the structure of a run.
 `RunStructure.find_obstacle` explains why a run must be computed alone.
 
 Invariant:
@@ -52,13 +52,14 @@ _ACTOR_CONSTANTS = ("kind", "sampled", "table_first", "table_count")
 
 
 class SiteStructure(NamedTuple):
-    """Properties of one site that select its equations, such as its type of control law.
+    """Properties of one site that determine its equations, such as its type of control law.
 
     Sites with equal properties share code.
 
     Attributes:
-        constants: Constants of the site.
-        actors: Constants of each operator and environment, operators first.
+        constants: Names and values of the constant fields of the site.
+        actors: Names and values of the constant fields of each operator and environment,
+            operators first.
         first_environment: Index of the first environment, or -1 if there is none.
         law: Compiled law of the site.
         prismatic: For each joint of a chain, 1 if it is prismatic, 0 if it is revolute.
@@ -80,7 +81,7 @@ class RunStructure(NamedTuple):
     Attributes:
         sites: Structure of each site.
         peers: Number of peers from which each site receives samples.
-        ramps: Largest number of planned changes of the dominance factors.
+        ramps: Largest number of planned changes of the dominance factors of one site.
         table: Shape and content of the data table of the operators and environments.
         duration_s: Planned duration of the run, s.
         settled_rad: Position error below which an arm counts as settled, rad.
@@ -101,7 +102,7 @@ class RunStructure(NamedTuple):
         different gains.
 
         Args:
-            run: The run. `find_obstacle` must have found no obstacle to computing it in a lane.
+            run: The run, for which `find_obstacle` must return an empty string.
         """
         memory = run.memory
         tables = memory.tables
@@ -136,12 +137,12 @@ class RunStructure(NamedTuple):
 
         Args:
             run: The run before its first tick.
-            hand_site: Index of a site whose live operator is replaced by the caller, who knows
-                this operator's actions. -1 if there is no such site.
+            hand_site: Index of the site whose arm the caller moves in place of the site's
+                operator program. -1 if there is no such site.
 
         Returns:
-            The property of the run that lanes do not support, or an empty string if lanes
-            support the run.
+            The reason, for example "control laws in plain Python", or an empty string if the
+            run can be simulated side by side with others.
         """
         config: Any = numba.config
         tables = run.memory.tables

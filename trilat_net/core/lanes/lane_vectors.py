@@ -82,10 +82,10 @@ class LaneVector(types.Type):
         return Conversion.safe if is_number and self.kind == "f8" else None
 
     def unify(self, _context: Any, other: Any) -> Any:
-        """Returns the type of a variable that is a vector in one branch, a scalar in another.
+        """Returns the type of a variable that is a vector or a scalar, depending on the branch.
 
-        Numba requires a single type per variable. This is the vector type, in which the scalar
-        is repeated for all eight runs. Returns None, which causes a compilation error, if the
+        Numba requires a single type per variable. The vector type is used, and the scalar is
+        repeated for all eight runs. Returns None, which causes a compilation error, if the
         vector does not contain floats or if the other value is not a number.
         """
         is_number = isinstance(other, types.Float | types.Integer)

@@ -19,7 +19,7 @@ from .lane_run import LaneRun
 from .lane_structure import RunStructure
 
 LEAST_RUNS = 4
-"""Smallest number of runs for which lanes are faster than simulating the runs one by one."""
+"""Smallest number of runs that are simulated faster in lanes than one by one."""
 
 
 LANE_SITE_TICKS = 100_000_000
@@ -33,7 +33,7 @@ tick.
 class RunGroup:
     """Several simulations that advance together, using vector instructions where possible.
 
-    Otherwise, they are computed one after another.
+    Where this is not possible, the simulations are computed one after another.
 
     Args:
         members: Indices of the runs in the sequence that was divided into groups.

@@ -35,7 +35,8 @@ class TwinLanes(LaneRun):
     The run itself is in lane 0.
 
     Args:
-        run: The run before its first tick, see `suits`. The object itself is not advanced.
+        run: The run before its first tick, see `suits`. Its state is copied, and this object
+            itself is not advanced.
         count: Number of runs, including the twins.
         ticks: Number of ticks of each site in the whole run.
         feed: Inputs of the recorded run to repeat.
@@ -205,7 +206,7 @@ class _LaneTwin:
         """Multiplies the difference between the states of this run and another run by a factor.
 
         Every floating-point value x of the state becomes x_other + factor (x - x_other), as in
-        `CompiledRun.scale_difference`. This includes states in transit.
+        `CompiledRun.scale_difference`. This includes states in transit on the network.
 
         Args:
             other: The other run, simulated together with this one.

@@ -59,7 +59,7 @@ holder.
 
 
 class HandReach(NamedTuple):
-    """Region of the positions that an arm can reach: a spherical shell, a box, or both.
+    """Region to which the goals for an arm are limited: a spherical shell, a box, or both.
 
     Goals outside the region are moved to its border. The region may be larger than the actual
     workspace of the arm.
@@ -79,9 +79,10 @@ class HandReach(NamedTuple):
     high: Vector = ()
 
     def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Returns the reachable position nearest to a goal, or the goal if it is reachable.
+        """Returns the position in the region that is nearest to a goal.
 
-        The goal is projected first onto the box, and then onto the spherical shell.
+        A goal inside the region is returned unchanged. A goal outside is projected first onto
+        the box, and then onto the spherical shell.
 
         Args:
             goal: The goal, rad or m.
@@ -124,7 +125,7 @@ class HandRules(NamedTuple):
         max_goal_norm: Largest norm of an accepted goal, m, rad or N.
         acceleration_limit: Largest acceleration of the target, m/s^2 or rad/s^2; inf for no
             limit.
-        reach: Region that contains the goals within reach of the arm.
+        reach: Region to which goals are limited.
     """
 
     size: int
@@ -198,10 +199,10 @@ class HandCommand(NamedTuple):
     who sends it, where the arm is to be pulled, and whether the arm is still held.
 
     Attributes:
-        source: Identifies the sender, a random number above 0.
+        source: Random number above 0 that identifies the sender.
         number: Sequence number of the sender's goal. Messages with the same number contain the
             same goal.
-        grip: True if the sender holds the arm, False to release it.
+        grip: True while the sender holds the arm, False to release the arm.
         target: Goal to which the sender pulls the arm, m or rad. In force mode, the force, N.
         sent_ns: Time of sending by the sender's clock, ns.
     """
@@ -232,8 +233,8 @@ class HandMemory(NamedTuple):
         sent_ns: Time at which the goal's message was sent, ns.
         received_ns: Time of the tick that accepted the newest message, ns since the start of
             the session.
-        before: The last sender that released the arm, and the sequence number of its last
-            message.
+        before: The last sender whose hold has ended, and the sequence number up to which its
+            messages are outdated.
     """
 
     source: int = 0
@@ -303,7 +304,7 @@ class HandInForce(NamedTuple):
         """Returns the field `hand` of a record for a tick in which nobody moves the arm.
 
         Args:
-            size: Number of coordinates of the target towards which a holder would pull the arm.
+            size: Number of coordinates of the target towards which the arm would be pulled.
         """
         return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
@@ -315,7 +316,7 @@ class HandStep(NamedTuple):
         memory: State for the next period.
         vector: Grip, target and target velocity in this period, as the log stores them (see
             `HandInForce`).
-        refused: The reason for each message that had no effect.
+        refused: For each message that had no effect, the reason why it was ignored.
         changes: Senders that took hold of the arm or released it, in order. Each entry contains
             the sender and TAKEN, RELEASED or SILENT (no message for too long).
     """
@@ -420,9 +421,9 @@ def glide(
     """Computes how a person or program pulls an arm in several ticks without a new message.
 
     A simulated spring pulls the arm towards a target, which moves to the goal of the last
-    message. The spring force is multiplied by the grip, a factor from 0 to 1 that grows
-    initially. The results are bit-identical to those of `HandRules.advance`, but a single
-    compiled call computes all ticks.
+    message. The spring force is multiplied by the grip, a factor that grows until it reaches 1.
+    The results are bit-identical to those of `HandRules.advance`, but a single compiled call
+    computes all ticks.
 
     Args:
         first: The first tick.

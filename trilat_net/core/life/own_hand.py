@@ -47,7 +47,7 @@ class HandContext(NamedTuple):
             "force" if it applies a force.
         size: Number of components of an action: one per axis, m or N, or one per joint, rad.
         rate_hz: Rate of decisions, Hz.
-        delay_s: Time from a view to the action based on it, s.
+        delay_s: Time from a `HandView` until the action based on it takes effect, s.
         speed_limit: Largest speed of the target, m/s or rad/s; inf in force mode.
         limit: Largest force, N, or largest norm of the torques, N m.
         seed: Seed for random numbers, derived from the scenario and the site.
@@ -75,15 +75,15 @@ class HandView(NamedTuple):
         t_s: Nominal time of the tick since the start of the session, s.
         q: Joint angles of the arm, rad, shape (n,).
         qd: Joint velocities, rad/s.
-        pose: Pose of the arm in the coordinates of the hand: end effector position, m, or joint
-            angles, rad.
+        pose: Pose of the arm in the coordinates in which the program acts: end effector
+            position, m, or joint angles, rad.
         q_des: Reference of the previous tick, rad or m, shape (m,).
         tau_x: External torque of the previous tick, N m; the torque ON the arm is its negative.
-        target: Current target of the hand, m or rad, or its force, N; zeros while the hand does
-            not hold the arm.
-        grip: Firmness of the hand's grip, 0 to 1.
-        peers: The peers in scenario order, with the samples in use at the previous tick. q and
-            qd have shape (m,). The ages refer to this tick.
+        target: Current target towards which the arm is pulled, m or rad, or the force, N; zeros
+            while nothing pulls the arm.
+        grip: Firmness of the program's grip on the arm, 0 to 1.
+        peers: Data of the peers in scenario order, from the samples in use at the previous
+            tick. The vectors q and qd of a peer have shape (m,). The ages refer to tick k.
     """
 
     k: int
@@ -161,7 +161,7 @@ class OwnHand:
     def find_next_event(self, k: int) -> int:
         """Returns the next tick after `k` in which a decision is made or takes effect.
 
-        All ticks before that can be computed by one compiled call of `advance_span`.
+        The ticks before that tick can be computed by one compiled call of `advance_span`.
         """
         next_decision = (k // self.period_ticks + 1) * self.period_ticks
         next_actions = [due for due, _ in self._due if due > k]
@@ -170,7 +170,8 @@ class OwnHand:
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Collects the data that the user's program may use for its decision.
 
-        These are the state of its own arm and the newest states received from other arms.
+        The data are the state of the program's own arm and the newest states received from
+        other arms.
 
         Args:
             k: Tick of the decision, whose results have not been computed yet.
@@ -237,9 +238,10 @@ class OwnHand:
         return tuple(peers)
 
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Checks a decision of the user's program, and schedules it after the reaction time.
+        """Checks a decision of the user's program, and schedules it to take effect later.
 
-        The decision is ignored if a decision based on a newer view has already been accepted.
+        The delay corresponds to a reaction time. The decision is ignored if a decision based on
+        a newer view has already been accepted.
 
         Args:
             k: Tick of the view on which the decision is based.
@@ -303,8 +305,8 @@ class OwnHand:
     def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
         """Computes how the user's program pulls the arm in tick k.
 
-        Decisions whose reaction time has passed take effect. Then the target of the hand
-        advances by one tick.
+        Decisions whose reaction time has passed take effect. Then the target towards which the
+        arm is pulled advances by one tick.
 
         Args:
             k: Number of the tick, which must directly follow the tick of the previous call.

@@ -29,8 +29,8 @@ def limit_reference(k: int, site: SiteRow) -> None:
     """Limits the speed of the reference, the position that the arm follows.
 
     Starting from its value in the previous tick, the reference moves by at most the permitted
-    step. If the limit has delayed it, it catches up later. In the first tick, it starts at the
-    pose of the arm.
+    step. A reference that the limit has delayed catches up later. In the first tick, the
+    reference starts at the pose of the arm.
 
     Args:
         k: Number of the tick.
