@@ -301,6 +301,18 @@ def test_other_hands_leave_small_gain_undecided() -> None:
         assert "no bound is known for walls" in scenario.describe_law_conditions()[0]
 
 
+def test_more_than_four_hands_leave_small_gain_undecided() -> None:
+    scenario = make_unit_scenario(
+        {
+            "m": {"hands": [make_spring(5.0)] * 5},
+            "s": {"control": {"follows": True}, "hands": [make_spring(5.0)]},
+        },
+        {"law": "impedance"},
+    )
+    condition = scenario.describe_law_conditions()[0]
+    assert "is undecided: evaluated for at most 4 hands at the masters" in condition
+
+
 SWING = {"model": "sine", "delay_ms": 440.0, "amplitude_ms": 137.0, "period_s": 1.6243}
 
 

@@ -39,15 +39,15 @@ class VirtualWall:
     Attributes:
         source: Description of the wall.
         normal: Unit vector along which the wall pushes, shape (2,) or (3,).
-        may_generate_energy: True if the wall has a stiffness, and its force is computed once
-            per tick and held. A force that follows the motion of the arm continuously generates
-            no energy.
+        may_generate_energy: True if the wall has a stiffness or a damping, and its force is
+            computed once per tick and held. A force that follows the motion of the arm
+            continuously generates no energy.
     """
 
     def __init__(self, source: TorqueSource) -> None:
         self.source = source
         self.normal: Array = np.array(source.b)
-        self.may_generate_energy = source.sampled and any(source.K)
+        self.may_generate_energy = source.sampled and (any(source.K) or any(source.B))
 
     @classmethod
     def list_of_site(cls, scenario: Scenario, site: str) -> list["VirtualWall"]:

@@ -204,11 +204,12 @@ class Impedance(ControlLaw):
         gain is therefore computed for every combination of the hands that the scenario defines
         at the masters, from none to all.
 
-        The condition is undecided in two cases:
+        The condition is undecided in three cases:
 
         - A delay varies. A gain below 1 at every frequency then does not prove stability.
         - A hand at a master, or the object that the slave touches, is not modelled as a spring
           and a damper per joint.
+        - More than `MOST_HANDS` hands act on the masters.
 
         The condition is not satisfied if there is not exactly one slave, if a site uses another
         law, or if a damping coefficient is zero.
@@ -243,11 +244,17 @@ class Impedance(ControlLaw):
                 "every frequency is no bound for delays that vary"
             )
             return StabilityCondition(None, text)
-        master_hands = _select_master_hands(hands, slave)
-        if slave_loads is None or master_hands is None:
+        if slave_loads is None or None in hands:
             text = (
                 "known for springs and dampers per joint, but a hand at a master or the "
                 "environment of the slave is of another kind (such a hand may void the bound)"
+            )
+            return StabilityCondition(None, text)
+        master_hands = _select_master_hands(hands, slave)
+        if master_hands is None:
+            text = (
+                f"evaluated for at most {MOST_HANDS} hands at the masters, of which each may "
+                "be absent, but there are more"
             )
             return StabilityCondition(None, text)
 

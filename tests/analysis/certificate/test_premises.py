@@ -99,6 +99,17 @@ def test_free_motion_satisfies_all_premises() -> None:
             {"on_stale__action": "hold", "on_stale__age_ms": 150.0, **CUT},
             "brake or return: s 0.6 to 1.",
         ),
+        (
+            "following",
+            {
+                "on_stale__action": "hold",
+                "on_stale__age_ms": 150.0,
+                "on_stale__return_s": 0.1,
+                **CUT,
+                "links.m2->s.outages_s": [[0.3, 0.5], [0.9, 1.1]],
+            },
+            "brake or return: s 0.45 to 0.7 s, s 1.05 to 1.3 s",
+        ),
         ("torque", {"limits__tau_limit_nm": 10.0}, "cut off: m1 at "),
     ],
 )
@@ -304,6 +315,13 @@ def test_a_damper_of_the_arm_dissipates_wall_energy(b: float, *, holds: bool) ->
     )
     assert wall is not None
     assert wall.holds is holds
+
+
+def test_a_sampled_damper_alone_may_generate_energy() -> None:
+    keys = {f"{SITE}.0.sampled": True, f"{SITE}.0.stiffness_n_m": 0.0}
+    wall = find_wall_premise(simulate_windup(**keys, **{f"{SITE}.0.damping_n_s_m": 50.0}))
+    assert wall is not None
+    assert wall.holds is False
 
 
 def test_sampled_or_missing_dampers_dissipate_nothing() -> None:

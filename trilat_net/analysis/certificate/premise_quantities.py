@@ -228,7 +228,7 @@ class DelayQuantities(NamedTuple):
 
 
 class Interruption(NamedTuple):
-    """Time from the first to the last moment at which an arm did not follow the other arms.
+    """Time during which an arm did not follow the other arms.
 
     The stability theorem requires that all arms follow throughout the run. An arm stops
     following, for example, when no samples arrive and it holds its position.
@@ -250,8 +250,8 @@ class FollowingQuantities(NamedTuple):
     The stability theorem requires this. It does not cover an arm that was held or stopped.
 
     Attributes:
-        interruptions: For each affected site, the time from the first to the last moment at
-            which it held its position, braked, moved back to its reference or had stopped.
+        interruptions: The times during which a site held its position, braked, moved back to
+            its reference or had stopped.
         limited_ticks: Number of ticks at which the reference velocity was limited, keyed by
             site name.
         is_halted: True if any site had stopped.

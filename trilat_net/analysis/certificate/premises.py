@@ -386,11 +386,8 @@ def _check_following(run: FunctionalFacts) -> Premise:
     interruptions = []
     is_halted = False
     for site in log.sites:
+        interruptions += _list_interruptions(timeline, site)
         intervals = timeline.find_mode_intervals(site)
-        if intervals:
-            from_s = intervals[0].from_s
-            to_s = intervals[-1].to_s
-            interruptions.append(Interruption(site, from_s, to_s))
         is_halted = is_halted or any(interval.mode in HALTED_MODES for interval in intervals)
 
     limited_ticks = {}
@@ -403,6 +400,25 @@ def _check_following(run: FunctionalFacts) -> Premise:
     holds = not interruptions and not limited_ticks
     quantities = FollowingQuantities(tuple(interruptions), limited_ticks, is_halted)
     return Premise("following", holds, quantities)
+
+
+def _list_interruptions(timeline: Timeline, site: str) -> list[Interruption]:
+    """Lists the times during which a site did not follow its peers, in chronological order.
+
+    Between two interruptions the site followed its peers, so modes that succeed each other
+    without a gap make up one interruption.
+
+    Args:
+        timeline: Timeline of the run.
+        site: Name of the site.
+    """
+    interruptions: list[Interruption] = []
+    for interval in timeline.find_mode_intervals(site):
+        if interruptions and interruptions[-1].to_s == interval.from_s:
+            interruptions[-1] = interruptions[-1]._replace(to_s=interval.to_s)
+        else:
+            interruptions.append(Interruption(site, interval.from_s, interval.to_s))
+    return interruptions
 
 
 def _check_torque_limits(run: FunctionalFacts) -> Premise:
