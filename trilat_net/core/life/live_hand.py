@@ -59,7 +59,7 @@ holder.
 
 
 class HandReach(NamedTuple):
-    """Region to which the goals for an arm are limited: a spherical shell, a box, or both.
+    """Region to which the goals for an arm are limited: a spherical shell or a box.
 
     Goals outside the region are moved to its border. The region may be larger than the actual
     workspace of the arm.
@@ -81,8 +81,8 @@ class HandReach(NamedTuple):
     def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
         """Returns the position in the region that is nearest to a goal.
 
-        A goal inside the region is returned unchanged. A goal outside is projected first onto
-        the box, and then onto the spherical shell.
+        A goal inside the region is returned unchanged. A goal outside is projected onto the
+        border of the region.
 
         Args:
             goal: The goal, rad or m.
