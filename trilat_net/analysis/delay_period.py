@@ -113,8 +113,8 @@ class DelayPeriod(NamedTuple):
         """Finds the period after which the delays of links and the ticks of sites repeat.
 
         The true period is the least common multiple of the tick periods and of the periods of
-        all delays. If it is longer than `MAX_PERIOD_TICKS`, a shorter time is sought after
-        which the delays nearly repeat.
+        all delays. If it is longer than `MAX_PERIOD_TICKS`, the method looks
+        for a shorter time after which the delays nearly repeat.
 
         Args:
             links: Delay models of the links.

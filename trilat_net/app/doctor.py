@@ -321,7 +321,7 @@ _RATES_CODE = (
 
 
 class MachineExamination:
-    """Examines whether this machine can run a session, with one method per subject.
+    """Checks whether this machine can run a session, with one method per check.
 
     Args:
         connection: Endpoints that this machine would listen on or connect to.

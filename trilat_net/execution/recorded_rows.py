@@ -146,7 +146,7 @@ class PlainRows:
         self._arrivals = np.zeros((0, 3), np.int64)
 
     def read_boot(self, row: int) -> int:
-        """Returns the boot in a record, a number that identifies a start of the process."""
+        """Returns the boot number of a record, which identifies a start of the process."""
         return int(self._boots[row]) & _MASK_64
 
     def count_plain(self, row: int, before_tick: int | None) -> int:

@@ -249,11 +249,11 @@ class Evidence(NamedTuple):
 
     Attributes:
         log: Recorded ticks of every site, and whether the log was modified.
-        functional_share: Fraction of the tick periods in which the energy of the stability
-            proof is known from records, excluding periods in which a site was absent. `None` if
-            this energy is not judged.
+        functional_share: Fraction of the tick periods in which the energy function V of the
+            stability proof can be computed from the records, excluding periods in which a site
+            was absent. `None` if V is not evaluated.
         min_coverage: Smallest sufficient fraction, both of recorded ticks and of tick periods
-            in which the energy is known.
+            in which V is known.
     """
 
     log: LogQuality

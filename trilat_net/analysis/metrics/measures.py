@@ -134,10 +134,7 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square over time of the worst column, such as the worst joint.
-
-    Each column contains the values of one joint. The largest root mean square of all columns is
-    returned.
+    """Returns the largest root mean square over time among the columns, one per joint.
 
     Args:
         values: Values of n quantities over time, shape (K, n).

@@ -131,7 +131,7 @@ class DelayMargin(NamedTuple):
 
     @property
     def description(self) -> str:
-        """A phrase for the user on the network delays for which the arms are stable.
+        """A phrase that states for which network delays the arms are stable.
 
         The delay is assumed to be the same on all links between the arms.
         """

@@ -812,7 +812,7 @@ class Following(NamedTuple):
         q_des: Numbers,
         qd_des: Numbers,
     ) -> "Following":
-        """Computes errors and reference motion with which n joints follow desired angles.
+        """Computes the errors and the reference motion of n joints that follow desired angles.
 
         The reference velocity of the joints is v = -Lambda (q - q_des), and the reference
         acceleration is its derivative.

@@ -849,7 +849,7 @@ class PushedTwins(Result):
         Raises:
             UsageError: A target does not exist, or a time, size or range is not allowed.
             LogError: The log cannot be read, or its run cannot be repeated.
-            CodeWithheld: The code of a law of the log may not be executed.
+            CodeWithheld: The run used a control law whose code is not permitted to run.
         """
         scenario = log.scenario
         targets = list(push.items()) if isinstance(push, Mapping) else [*map(_parse_push, push)]

@@ -118,7 +118,7 @@ def _advance_hands(
     rows: Array,
     actions: Array,
 ) -> None:
-    """Computes how programs pull the arms in the next ticks, for several simulations at once.
+    """Computes the grips and targets that programs apply to the arms of several simulations.
 
     Each simulation has one program. Its decision at the first tick remains in effect for all
     these ticks.
@@ -186,7 +186,7 @@ def _advance_hands(
 
 
 class SeveralHands:
-    """Computes how programs pull the arms in several simulations at once.
+    """Computes the grips and targets that programs apply to the arms of several simulations.
 
     A training environment, for example, simulates many runs in parallel, with one program
     moving one arm in each run. One compiled call then replaces one call per run.

@@ -282,7 +282,7 @@ class ReachTrial(_TrialTask, frozen=True, tag="reach"):
     def render_instructions(self, slave: str) -> str:
         """Returns the instructions shown to participants for a reaching trial.
 
-        If the task has a corridor, the instructions state how far the arm may leave the
+        If the task has a corridor, the instructions state how far the arm may deviate from the
         straight path to the target. If it has a handover, they state when the other user takes
         over.
 

@@ -245,7 +245,7 @@ class Stage:
 
         Args:
             step: The step.
-            rest_s: Minimum rest of the users before the step, in s.
+            rest_s: Minimum time that the users rest before the step, in s.
             done: Sites of the users who have already completed the step.
 
         Returns:

@@ -325,7 +325,7 @@ class MessageLimits:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """Rights of a person at a web page, and the site whose view the page shows.
+    """Rights of the user of a web page, and the site whose view the page shows.
 
     Attributes:
         kind: Kind of role. An experimenter may do everything, a user may hold the arm of one
