@@ -105,7 +105,13 @@ def test_rows_that_grow_are_true(row: Row) -> None:
 
 BLOCK = 400
 OPEN_SHARE = 0.08
-"""Of whatever was drawn, most that may stay open."""
+"""Of the drawn runs of the core's laws, most that a sweep may leave open."""
+OPEN_SHARE_OF_ALL_LAWS = 0.25
+"""Of the drawn runs of all laws, most that `certify` may leave open.
+
+Laws without exact roots are judged by twins, and these cannot show growth while the delays have
+not repeated (docs/data/adversarial-runs.csv, row "anything").
+"""
 
 
 LOGGED = range(24, 40)
@@ -156,7 +162,8 @@ def _hold_near_an_edge(counts: Tally) -> None:
 @pytest.mark.long
 def test_certificates_of_widely_drawn_runs_are_right() -> None:
     """Runs near an edge do not count; `truths.csv` has the rates at which pushes grow."""
-    _assert_right(tally_clear(map(judge_experiment, range(WIDE_FROM, count_stored()))))
+    judged = map(judge_experiment, range(WIDE_FROM, count_stored()))
+    _assert_right(tally_clear(judged), OPEN_SHARE_OF_ALL_LAWS)
 
 
 @pytest.mark.push
@@ -174,11 +181,11 @@ def test_sweeps_of_widely_drawn_runs_are_right() -> None:
     )
 
 
-def _assert_right(counts: Tally) -> None:
+def _assert_right(counts: Tally, open_share: float = OPEN_SHARE) -> None:
     """Asserts that no unstable run is called stable, and that few words are wrong otherwise, or missing."""
     assert counts.false_ok == 0
     assert counts.false_alarm <= 0.01 * counts.runs
-    assert counts.undecided <= max(1, OPEN_SHARE * counts.runs)
+    assert counts.undecided <= max(1, open_share * counts.runs)
 
 
 @pytest.mark.parametrize(

@@ -77,8 +77,13 @@ def list_pushes(growth: TwinGrowth) -> list[tuple[str, ...]]:
     ]
 
 
-def _without_theorem(rests_on: str) -> str:
-    """Returns a basis without the theorem that may precede it."""
+def _strip_basis(rests_on: str) -> str:
+    """Returns a basis without what only a log shows.
+
+    That is the theorem, which may precede the basis, and which joint diverged and how.
+    """
+    if rests_on.startswith("diverged: "):
+        return "diverged"
     return rests_on.removeprefix(THEOREM).removeprefix("; ")
 
 
@@ -94,18 +99,18 @@ def list_statements(scenario: Scenario) -> list[Statement]:
     certified = Statement(
         command="certify",
         word=decision.stability.value,
-        rests_on=_without_theorem(decision.rests_on),
+        rests_on=_strip_basis(decision.rests_on),
         roots=roots.verdict,
         rate_per_s=roots.rate_per_s,
         pushes=list_pushes(twins),
     )
     cell = classify_cell(scenario.text, scenario.duration_s)
-    swept = Statement("sweep", cell.stability, _without_theorem(cell.rests_on))
+    swept = Statement("sweep", cell.stability, _strip_basis(cell.rests_on))
     suite_run = JudgedRun.simulate(scenario, scenario.duration_s)
     benched = Statement(
         command="bench",
         word=suite_run.stability.value,
-        rests_on=_without_theorem(suite_run.rests_on),
+        rests_on=_strip_basis(suite_run.rests_on),
         roots=suite_run.roots.verdict,
         rate_per_s=suite_run.roots.rate_per_s,
     )

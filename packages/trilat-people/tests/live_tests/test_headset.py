@@ -111,6 +111,9 @@ def move_arm(page: Page, controllers: Controllers) -> bool:
     dropped = page.evaluate("trilat.parts.headset.dropped")
     controllers.press("right", "trigger", 1.0)
     wait_until_page(page, "trilat.frame.holds.includes('m1')")
+    # The target rests at the place of the arm before the controller moves.
+    held_s = page.evaluate("trilat.frame.t")
+    wait_until_page(page, f"trilat.frame.t > {held_s + 0.3}")
     path_m = [(0.2 - 0.004 * n, 1.2 + 0.006 * n, -0.3 - 0.01 * n) for n in range(1, 11)]
     jump_m = [(0.76, 1.26, -0.4), (0.16, 1.26, -0.4)]
     for position_m in path_m + jump_m:
