@@ -27,7 +27,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 _LLEWELLYN = (
     "transparent without delay only; with delay no bound is known that holds for every "
-    "operator and environment: Llewellyn's condition decides, see trilat ports"
+    "operator and environment: Llewellyn's condition decides, see trilat linear"
 )
 
 _NEUTRAL = (
@@ -237,7 +237,7 @@ class FourChannel(ControlLaw):
 
         If the feedforward gain `acceleration` is 1, high frequencies are undamped, and the
         condition is not satisfied. In all other cases, stability also depends on the arms, and
-        the condition is undecided (`holds` is None). The command `trilat ports` then evaluates
+        the condition is undecided (`holds` is None). The command `trilat linear` then evaluates
         Llewellyn's criterion for absolute stability.
         """
         if self.acceleration >= 1.0:

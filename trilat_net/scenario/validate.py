@@ -63,10 +63,10 @@ def _check_law(name: str, site: SiteSpec, sites: int) -> None:
             path=f"{path}.control.law",
         )
 
-    # An adaptive law estimates the parameters theta of the arm, and with them its weight.
-    learns_arm = getattr(law.kind, "needs_theta", False)
+    # A law that needs theta is refused for an unknown arm with a reason of its own.
+    needs_theta = getattr(law.kind, "needs_theta", False)
     feeds_gravity = getattr(law, "gravity", 0.0) * site.arm.g_m_s2 > 0.0
-    if not site.arm.known and not learns_arm and feeds_gravity:
+    if not site.arm.known and not needs_theta and feeds_gravity:
         raise ScenarioError(
             f"{law.tag} computes gravity from the arm's masses, which are unknown (arm.known = "
             "false): set gravity = 0 if the arm compensates gravity itself, set arm.g_m_s2 = 0 "

@@ -38,7 +38,7 @@ MAX_SEEDS = 100_000
 """Largest number of seeds in the option --seeds."""
 
 
-@options.command("jitter --seeds 1..20 --junit out.xml", page="docs/tutorials/lab.md")
+@options.command("jitter --seeds 1..20 --junit out.xml", page="docs/studies/seeds.md")
 def test_command(
     scenarios: Annotated[
         list[str] | None,

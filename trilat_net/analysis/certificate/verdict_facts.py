@@ -26,8 +26,8 @@ class StabilityFinding(Enum):
     """
 
     COVERED = auto()
-    """All premises of the theorem hold and V did not rise. The theorem then proves the run
-    stable.
+    """No premise of the theorem fails, and V did not rise. If all premises hold, the theorem
+    proves the run stable.
     """
     DID_NOT_RISE = auto()
     """A premise of the theorem fails, and V did not rise."""

@@ -1224,7 +1224,7 @@ def show_on_page(
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
     """Context manager that serves a web page for a session run by other processes.
 
-    Used by `trilat watch --page` as the argument `show` of `watch_session`.
+    Used by `trilat live --session` as the argument `show` of `watch_session`.
 
     Args:
         options: Address, encryption and further options of the server.
