@@ -1,8 +1,8 @@
 """Shows a running session until it ends, in a terminal or on a web page.
 
 `watch_session` connects to the session and updates a display, which is either a table in the
-terminal (`trilat watch`) or a page (`trilat live --session`). If standard input is a terminal, a
-key stops every arm.
+terminal (`trilat watch`) or a page (`trilat live --session`). If standard input is a terminal,
+a key stops every arm.
 """
 
 import os
