@@ -148,7 +148,7 @@ class GainQuantities(NamedTuple):
 
 
 class WallQuantities(NamedTuple):
-    """Evidence on whether simulated walls add no energy to the arms, as the theorem requires.
+    """Evidence on whether simulated walls add energy to the arms, which the theorem excludes.
 
     A wall whose force is computed once per tick generates energy. The wall adds no energy to
     the arm if the damping of the arm removes all of it.

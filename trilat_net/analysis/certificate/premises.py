@@ -22,7 +22,7 @@ Invariant:
     - A log that was modified after it was written does not pass.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -386,8 +386,8 @@ def _check_following(run: FunctionalFacts) -> Premise:
     interruptions = []
     is_halted = False
     for site in log.sites:
-        interruptions += _list_interruptions(timeline, site)
         intervals = timeline.find_mode_intervals(site)
+        interruptions += _list_interruptions(site, intervals)
         is_halted = is_halted or any(interval.mode in HALTED_MODES for interval in intervals)
 
     limited_ticks = {}
@@ -402,22 +402,25 @@ def _check_following(run: FunctionalFacts) -> Premise:
     return Premise("following", holds, quantities)
 
 
-def _list_interruptions(timeline: Timeline, site: str) -> list[Interruption]:
+def _list_interruptions(
+    site: str, intervals: Sequence[tuple[str, float, float]]
+) -> list[Interruption]:
     """Lists the times during which a site did not follow its peers, in chronological order.
 
     Between two interruptions the site followed its peers, so modes that succeed each other
     without a gap make up one interruption.
 
     Args:
-        timeline: Timeline of the run.
         site: Name of the site.
+        intervals: Mode, start and end of each interval in which the site did not follow, see
+            `Timeline.find_mode_intervals`.
     """
     interruptions: list[Interruption] = []
-    for interval in timeline.find_mode_intervals(site):
-        if interruptions and interruptions[-1].to_s == interval.from_s:
-            interruptions[-1] = interruptions[-1]._replace(to_s=interval.to_s)
+    for _, from_s, to_s in intervals:
+        if interruptions and interruptions[-1].to_s == from_s:
+            interruptions[-1] = interruptions[-1]._replace(to_s=to_s)
         else:
-            interruptions.append(Interruption(site, interval.from_s, interval.to_s))
+            interruptions.append(Interruption(site, from_s, to_s))
     return interruptions
 
 

@@ -524,7 +524,7 @@ class VizChannels:
             buckets.finish(log_ns)
 
     def open_channels(self, file: McapWriter) -> ros2_messages.StandardChannels:
-        """Returns the channels for viewers such as Foxglove in one file of a log.
+        """Returns the channels that a file of a log has for viewers such as Foxglove.
 
         A channel is registered in the file only when its first message is written.
 
